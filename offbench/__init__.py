@@ -1,0 +1,63 @@
+"""offbench: offline-RL datasets from today's Gymnasium MuJoCo tasks, and algorithms benchmarked on them.
+
+    import offbench
+
+    dataset_id = offbench.collect("hopper", "medium")       # a Minari dataset
+    data = offbench.load(dataset_id)                        # flat float32 arrays
+    runs = offbench.train("bdb", dataset_id, seeds=range(5), beta=0.5)
+    offbench.evaluate(runs[0]).scores
+    offbench.normalize()                                    # every run below ./runs
+
+The command line (`offbench --help`) calls these same functions.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from offbench.errors import OffbenchError
+
+if TYPE_CHECKING:
+    from offbench.agents import behaviour
+    from offbench.assess import evaluate
+    from offbench.describe import inventory, show
+    from offbench.launch import train
+    from offbench.record import collect
+    from offbench.tables import normalize_runs_or_returns as normalize
+    from offbench.transitions import load
+
+__all__ = [
+    "OffbenchError",
+    "behaviour",
+    "collect",
+    "evaluate",
+    "inventory",
+    "load",
+    "normalize",
+    "show",
+    "train",
+]
+
+# Loaded when first used: `offbench list` must not wait for PyTorch.
+_VERBS = {
+    "behaviour": ("offbench.agents", "behaviour"),
+    "collect": ("offbench.record", "collect"),
+    "evaluate": ("offbench.assess", "evaluate"),
+    "inventory": ("offbench.describe", "inventory"),
+    "load": ("offbench.transitions", "load"),
+    "normalize": ("offbench.tables", "normalize_runs_or_returns"),
+    "show": ("offbench.describe", "show"),
+    "train": ("offbench.launch", "train"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _VERBS:
+        raise AttributeError(f"module 'offbench' has no attribute {name!r}")
+    module, attribute = _VERBS[name]
+    return getattr(importlib.import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,64 @@
+"""Where a result came from: versions, hardware, and whether the physics are the ones it was made on."""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import os
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("offbench", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "minari")
+
+
+@functools.cache
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that results depend on."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def hardware() -> dict[str, Any]:
+    """Return processor and cores, for provenance."""
+    return {"hardware": {"processor": _processor(), "cores": os.cpu_count(), "machine": platform.machine()}}
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or "unknown"
+
+
+def warn_other_physics(what: str, recorded: dict[str, str]) -> None:
+    """Print a warning when `what` was made on another MuJoCo release series than is installed."""
+    made, here = recorded.get("mujoco", ""), versions()["mujoco"]
+    if made and not _same_physics(made, here):
+        print(
+            f"offbench: warning: {what} was made with mujoco {made}, installed is {here}: "
+            "the physics differ, scores may not compare",
+            file=sys.stderr,
+        )
+
+
+def _same_physics(a: str, b: str) -> bool:
+    """Return whether two MuJoCo versions lie on the same side of 3.5.0, where Hopper's motion changed."""
+
+    def new(version: str) -> bool:
+        major, minor = (int(part) for part in version.split(".")[:2])
+        return (major, minor) >= (3, 5)
+
+    try:
+        return new(a) == new(b)
+    except ValueError:
+        return a == b

@@ -1,0 +1,42 @@
+"""Every random number of offbench: SeedSequence([seed, purpose, *index]), never a global generator.
+
+What a number is for is part of its seed, so episode i of a dataset depends on (seed, i) alone and comes out
+the same for any number of workers and after any resume.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Purpose(IntEnum):
+    """What random numbers are drawn for. Never renumber: recorded datasets depend on it."""
+
+    RESET = 1  # initial state of episode i
+    ACTION = 2  # action noise of episode i
+    SAC = 3  # segment i of a behaviour agent's training
+    RUNG = 4  # the episodes that screen rung i
+    MEASURE = 5  # the episodes that choose rungs
+    REFERENCE = 6  # the episodes behind a published reference score
+    WEIGHTS = 7  # initial weights of network i
+    CHUNK = 8  # batches and noise of chunk i of a run
+    EVALUATION = 9  # the episodes of a run's evaluation at step i
+    MIX = 10  # part i of a blend of levels
+    SAMPLE = 11  # which transitions or episodes a picture or a check looks at
+
+
+def sequence(seed: int, purpose: Purpose, *index: int) -> np.random.SeedSequence:
+    """Return the seed sequence of one purpose and index (all non-negative integers)."""
+    return np.random.SeedSequence([seed, int(purpose), *index])
+
+
+def generator(seed: int, purpose: Purpose, *index: int) -> np.random.Generator:
+    """Return a NumPy generator that belongs to this purpose and index alone."""
+    return np.random.default_rng(sequence(seed, purpose, *index))
+
+
+def integer(seed: int, purpose: Purpose, *index: int) -> int:
+    """Return a 63-bit seed for a generator that is not NumPy's (an environment, PyTorch)."""
+    return int(sequence(seed, purpose, *index).generate_state(1, np.uint64)[0] >> np.uint64(1))
