@@ -1,0 +1,56 @@
+"""Checkpoints: safetensors with a JSON state beside the tensors, the newest two kept, nothing ever unpickled."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from offbench.files import write_bytes
+
+KEPT = 2
+_NAME = re.compile(r"checkpoint-(\d{9,})\.safetensors")
+
+State = dict[str, Any]
+
+
+def save_checkpoint(folder: Path, step: int, tensors: dict[str, torch.Tensor], state: State) -> None:
+    """Write checkpoint-<step>.safetensors, whole or not at all."""
+    whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    data = save(whole, metadata={"offbench": json.dumps(state, sort_keys=True)})
+    write_bytes(folder / f"checkpoint-{step:09d}.safetensors", data)
+
+
+def steps(folder: Path) -> list[int]:
+    """Return the steps that have a checkpoint in `folder`, newest first."""
+    found = (_NAME.fullmatch(path.name) for path in folder.glob("checkpoint-*.safetensors"))
+    return sorted((int(match[1]) for match in found if match), reverse=True)
+
+
+def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], State] | None:
+    """Read one checkpoint; None (and a line on stderr) if it is damaged."""
+    path = folder / f"checkpoint-{step:09d}.safetensors"
+    try:
+        with safe_open(path, framework="pt") as file:
+            state = json.loads((file.metadata() or {})["offbench"])
+            return {name: file.get_tensor(name) for name in file.keys()}, state  # noqa: SIM118
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        print(f"offbench: {path} is damaged ({error}); using the one before it", file=sys.stderr)
+        return None
+
+
+def load_newest(folder: Path) -> tuple[dict[str, torch.Tensor], State] | None:
+    """Read the newest checkpoint that is whole, or return None."""
+    return next((found for step in steps(folder) if (found := load_checkpoint(folder, step))), None)
+
+
+def keep_newest(folder: Path) -> None:
+    """Delete all but the newest checkpoints."""
+    for step in steps(folder)[KEPT:]:
+        (folder / f"checkpoint-{step:09d}.safetensors").unlink(missing_ok=True)

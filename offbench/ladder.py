@@ -1,0 +1,272 @@
+"""The ladder: the rungs of a behaviour agent that recording needs, measured over enough episodes to publish.
+
+    a training's folder (every rung, a few episodes each)
+        -> expert   the best of the late rungs, by measured return
+        -> medium   the first rung at one third (to 0.45) of the expert's normalised return
+        -> others   the rungs nearest 1/12, 2/12, ... of it, for `--level FRACTION`
+        -> ladder/  ladder.json  ladder.csv  policies/*.safetensors  medium-replay.npz
+
+Returns are of the sampling policy, normalised between the uniform-random and the expert reference. A rung is
+chosen on one set of episodes; the expert's reference score is measured on another, so being chosen for its
+luck does not flatter it.
+"""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from offbench.errors import OffbenchError
+from offbench.files import csv_bytes, disk_errors, read_json, write_bytes, write_json
+from offbench.policy import Policy, load_policy, uniform
+from offbench.rollout import Outcome, Rollouts, make_env
+from offbench.scores import interval, normalize
+from offbench.seeds import Purpose
+
+if TYPE_CHECKING:
+    from offbench.sac import Training
+
+MEDIUM = 1 / 3  # of the expert's normalised return
+MEDIUM_AT_MOST = 0.45  # a rung beyond this is no medium while there is another
+CANDIDATES = 8  # late rungs that are measured to find the expert
+MEASURES = ("return", "low", "high", "length")
+COLUMNS = ("step", "hours", "role", "policy", *MEASURES, *(f"deterministic_{m}" for m in MEASURES), "episodes")
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One measured rung. `low` and `high` are the 95% interval of the mean return."""
+
+    step: int
+    role: str
+    policy: str
+    ret: float
+    low: float
+    high: float
+    episodes: int
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """A ladder's folder, read."""
+
+    folder: Path
+    info: dict[str, Any]
+    rungs: tuple[Rung, ...]
+
+    @property
+    def random_return(self) -> float:
+        """Mean return of the uniform-random policy: the reference's 0."""
+        return float(self.info["references"]["random"]["return"])
+
+    @property
+    def expert_return(self) -> float:
+        """Mean return of the expert: the reference's 100."""
+        return float(self.info["references"]["expert"]["return"])
+
+    def fraction(self, rung: Rung) -> float:
+        """Return a rung's normalised return, 1 for the expert's."""
+        return normalize(rung.ret, self.random_return, self.expert_return) / 100
+
+    def nearest(self, fraction: float) -> Rung:
+        """Return the kept rung whose measured normalised return lies nearest `fraction`."""
+        return min(self.rungs, key=lambda rung: abs(self.fraction(rung) - fraction))
+
+    def role(self, role: str) -> Rung:
+        """Return the rung that is `medium` or `expert`."""
+        return next(rung for rung in self.rungs if role in rung.role.split("+"))
+
+    def load(self, rung: Rung) -> Policy:
+        """Read a rung's policy."""
+        return load_policy(self.folder / "policies" / rung.policy)
+
+    @property
+    def replay(self) -> Path:
+        """The transitions of medium-replay."""
+        return self.folder / "medium-replay.npz"
+
+
+def read_ladder(folder: Path) -> Ladder | None:
+    """Read a ladder's folder, or return None if there is no whole one. Raises OffbenchError if it is damaged."""
+    if not (folder / "ladder.json").exists():
+        return None
+    info = read_json(folder / "ladder.json")
+    try:
+        with open(folder / "ladder.csv", newline="", encoding="utf-8") as file:
+            rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
+        ladder = Ladder(folder, info, rungs)
+        if not (np.isfinite([ladder.random_return, ladder.expert_return]).all() and ladder.role("medium")):
+            raise ValueError("its references are not numbers")
+    except (OSError, KeyError, ValueError, TypeError, StopIteration) as error:
+        raise OffbenchError(f"the ladder in {folder} is damaged ({error!r}); train it anew with --retrain") from None
+    return ladder
+
+
+def _rung(row: dict[str, str]) -> Rung:
+    mean, low, high = (float(row[key]) for key in ("return", "low", "high"))
+    if not np.isfinite([mean, low, high]).all() or "/" in row["policy"]:
+        raise ValueError(f"rung {row['step']}")
+    return Rung(int(row["step"]), row["role"], row["policy"], mean, low, high, int(row["episodes"]))
+
+
+class Surveyor:
+    """Measures rungs of a training, each at most once."""
+
+    def __init__(self, training: Training, rows: list[dict[str, float]], rollouts: Rollouts) -> None:
+        self.training, self.rollouts = training, rollouts
+        self.screened = {int(row["step"]): row for row in rows}
+        self.measured: dict[int, dict[str, float]] = {}
+
+    def measure(self, step: int) -> float:
+        """Return the mean return of a rung over the recipe's `rung_episodes`."""
+        if step not in self.measured:
+            policy = load_policy(self.training.policy(step))
+            count = self.training.recipe.measure.rung_episodes
+            row: dict[str, float] = {"episodes": count}
+            for prefix, deterministic in (("", False), ("deterministic_", True)):
+                stream = (int(Purpose.MEASURE), step, int(deterministic))
+                row |= summary(self.run(policy, stream, count, deterministic), prefix)
+            self.measured[step] = row
+            _say(f"rung {step}: return {row['return']:.1f} over {count} episodes")
+        return self.measured[step]["return"]
+
+    def run(self, policy: Policy, stream: tuple[int, ...], count: int, deterministic: bool = False) -> list[Outcome]:
+        """Play evaluation episodes."""
+        return self.rollouts.outcomes(policy, self.training.seed, stream, count, deterministic).result()
+
+    def expert(self) -> int:
+        """Return the best rung of the second half by measured return."""
+        last = max(self.screened)
+        late = [step for step in self.screened if step > last / 2]
+        late.sort(key=lambda step: self.screened[step]["stochastic_return"], reverse=True)
+        return max(late[:CANDIDATES], key=self.measure)
+
+    def medium(self, target: float, most: float, expert: int) -> int:
+        """Return the first rung whose measured return lies between `target` and `most`, else the nearest to `target`."""
+        early = [step for step in sorted(self.screened) if step <= expert]
+        for step in early:
+            # measure only what its screening interval says might lie there
+            if self.screened[step]["stochastic_high"] >= target and target <= self.measure(step) <= most:
+                return step
+        return self.nearest(target, early)
+
+    def nearest(self, target: float, among: Iterable[int] | None = None) -> int:
+        """Return the rung (of those `among`) whose best known return lies nearest `target`."""
+
+        def distance(step: int) -> float:
+            known = self.measured.get(step, {}).get("return", self.screened[step]["stochastic_return"])
+            return abs(known - target)
+
+        step = min(self.screened if among is None else among, key=distance)
+        self.measure(step)
+        return step
+
+
+def summary(outcomes: list[Outcome], prefix: str = "") -> dict[str, float]:
+    """Return mean return, its 95% interval and mean length."""
+    mean, low, high = interval([o.ret for o in outcomes])
+    length = float(np.mean([o.length for o in outcomes]))
+    values = {"return": mean, "low": low, "high": high, "length": length}
+    return {prefix + key: round(value, 4) for key, value in values.items()}
+
+
+def build_ladder(training: Training, steps: int, out: Path, workers: int, command: str) -> Ladder:
+    """Choose and measure the rungs of a training up to `steps`, and write the ladder's folder `out`.
+
+    Raises:
+        OffbenchError: no rung beats the random policy, or the disk refuses.
+    """
+    from offbench.sac import read_rungs  # here, because behaviour needs PyTorch and collect does not
+
+    rows = [row for row in read_rungs(training.rungs) if row["step"] <= steps]
+    if not rows:
+        raise OffbenchError(f"{training.folder} has no rung yet; train at least one segment")
+    spec = training.recipe.env_spec()
+    with Rollouts(spec, workers) as rollouts:
+        surveyor = Surveyor(training, rows, rollouts)
+        episodes = training.recipe.measure.reference_episodes
+        random = _random_policy(spec, training.recipe.env_id)
+        references = {"random": summary(surveyor.run(random, (int(Purpose.REFERENCE), 0), episodes))}
+        expert = surveyor.expert()
+        policy = load_policy(training.policy(expert))
+        references["expert"] = summary(surveyor.run(policy, (int(Purpose.REFERENCE), 1), episodes))
+        worst, best = references["random"]["return"], references["expert"]["return"]
+        if best <= worst:
+            raise OffbenchError(
+                f"after {steps} steps no rung beats the random policy ({best:.1f} against {worst:.1f}): train longer"
+            )
+        medium = surveyor.medium(worst + MEDIUM * (best - worst), worst + MEDIUM_AT_MOST * (best - worst), expert)
+        parts = training.recipe.measure.rungs
+        others = {surveyor.nearest(worst + i / parts * (best - worst)) for i in range(1, parts)}
+    roles: dict[int, str] = dict.fromkeys(sorted(others | {medium, expert}), "")
+    for step, role in ((medium, "medium"), (expert, "expert")):
+        roles[step] = f"{roles[step]}+{role}".lstrip("+")
+    info = read_json(training.folder / "training.json") | {
+        "format": "offbench-ladder-1",
+        "command": command,
+        "steps": steps,
+        "hours": rows[-1]["hours"],
+        "references": {name: values | {"episodes": episodes} for name, values in references.items()},
+        "levels": {"medium": medium, "expert": expert},
+    }
+    _write(training, out, rows, surveyor, roles, info)
+    ladder = read_ladder(out)
+    assert ladder is not None
+    return ladder
+
+
+def _random_policy(spec: str, env_id: str) -> Policy:
+    env = make_env(spec)
+    space, dim = env.action_space, env.observation_space.shape
+    env.close()
+    assert dim is not None
+    return uniform(space.low, space.high, dim[0], env_id)  # type: ignore[attr-defined]
+
+
+def _write(
+    training: Training,
+    out: Path,
+    rows: list[dict[str, float]],
+    surveyor: Surveyor,
+    roles: dict[int, str],
+    info: dict[str, Any],
+) -> None:
+    """Write the ladder aside, then put it in its place; ladder.json says it is whole."""
+    from offbench.replay import replay_episodes, save_replay
+
+    aside = out.with_name(f".{out.name}.partial")
+    with disk_errors(str(out)):
+        shutil.rmtree(aside, ignore_errors=True)
+        (aside / "policies").mkdir(parents=True)
+        for step in roles:
+            shutil.copyfile(training.policy(step), aside / "policies" / training.policy(step).name)
+        write_bytes(aside / "ladder.csv", csv_bytes(COLUMNS, _table(training, rows, surveyor, roles)))
+        info["medium_replay"] = save_replay(
+            aside / "medium-replay.npz", replay_episodes(training, info["levels"]["medium"])
+        )
+        write_json(aside / "ladder.json", info)
+        shutil.rmtree(out, ignore_errors=True)
+        aside.replace(out)
+
+
+def _table(
+    training: Training, rows: list[dict[str, float]], surveyor: Surveyor, roles: dict[int, str]
+) -> Iterator[list[Any]]:
+    """Yield a row for every rung: measured where it was measured, screened elsewhere; `episodes` says which."""
+    for row in rows:
+        step = int(row["step"])
+        values = {key.removeprefix("stochastic_"): value for key, value in row.items()}
+        values |= surveyor.measured.get(step, {})
+        kept = {"role": roles.get(step, ""), "policy": training.policy(step).name if step in roles else ""}
+        yield [(values | kept)[key] for key in COLUMNS]
+
+
+def _say(line: str) -> None:
+    print(f"offbench: {line}", file=sys.stderr, flush=True)

@@ -1,0 +1,45 @@
+"""Scores: normalisation against named references, and the statistics of few seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+
+def interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Return the mean of `values` and its 95% interval (Student's t).
+
+    One value has no interval: both ends are the value itself.
+    """
+    from scipy import stats
+
+    data = np.asarray(values, np.float64)
+    mean = float(data.mean())
+    if len(data) < 2:
+        return mean, mean, mean
+    half = float(stats.t.ppf(0.975, len(data) - 1) * data.std(ddof=1) / np.sqrt(len(data)))
+    return mean, mean - half, mean + half
+
+
+def normalize(value: float, low: float, high: float) -> float:
+    """Return 100 (value - low) / (high - low): 0 for the random policy, 100 for the expert (D4RL)."""
+    return 100.0 * (value - low) / (high - low)
+
+
+LAST = 10  # evaluations behind a run's score
+
+
+def run_return(evaluations: Mapping[int, Sequence[tuple[float, int]]]) -> float:
+    """Return a run's mean return over its last 10 evaluations (never its best checkpoint).
+
+    Args:
+        evaluations: {step: [(return, length) of each episode]}.
+    """
+    means = [np.mean([value for value, _ in evaluations[step]]) for step in sorted(evaluations)[-LAST:]]
+    return float(np.mean(means))
+
+
+def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
+    """Return mean and standard deviation over seeds (n - 1 below the line); one seed has no deviation."""
+    return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
