@@ -1,0 +1,192 @@
+"""Minari datasets on disk: written aside and renamed, so that an id never names half a dataset."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import shutil
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock, Timeout
+from gymnasium.envs.registration import EnvSpec
+
+from offbench.errors import OffbenchError, unknown
+from offbench.files import disk_errors, read_json
+from offbench.policy import Array
+from offbench.rollout import Episode
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.dataset.minari_storage import MinariStorage
+
+KEY = "offbench"  # under which all that Minari has no field for is kept in the metadata
+BYTES_PER_EPISODE = 14_000  # what HDF5 needs beside the numbers themselves, measured on short episodes
+
+
+def root() -> Path:
+    """Return Minari's folder: $MINARI_DATASETS_PATH, else ~/.minari/datasets."""
+    path = os.environ.get("MINARI_DATASETS_PATH")
+    return Path(path) if path else Path.home() / ".minari" / "datasets"
+
+
+def check_id(dataset_id: str) -> str:
+    """Return `dataset_id` if Minari can parse it: `name-v0` or `namespace/name-v0`."""
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError):
+        raise OffbenchError(
+            f"{dataset_id!r} is not a dataset id: use letters, digits, - and _, and end with -v0"
+        ) from None
+    return dataset_id
+
+
+def path_of(dataset_id: str) -> Path:
+    """Return the folder of a dataset id, whether it exists or not."""
+    return root() / check_id(dataset_id)
+
+
+def local_ids() -> list[str]:
+    """Return the ids of all local datasets, hidden folders and strays left out."""
+    base = root()
+    if not base.is_dir():
+        return []
+    found = (path.parent.parent.relative_to(base) for path in base.glob("**/data/metadata.json"))
+    return sorted(str(path) for path in found if not any(part.startswith(".") for part in path.parts))
+
+
+def read_metadata(dataset_id: str) -> dict[str, Any]:
+    """Return a local dataset's metadata as Minari wrote it.
+
+    Raises:
+        OffbenchError: no such dataset (the nearest id is named), or its metadata are damaged.
+    """
+    path = root() / dataset_id / "data" / "metadata.json"
+    if dataset_id.startswith((".", "/")) or ".." in Path(dataset_id).parts or not path.exists():
+        known = local_ids()
+        hint = "" if known else "; record one with `offbench collect ENV --level LEVEL`"
+        raise OffbenchError(f"{unknown('dataset', dataset_id, known)}{hint}")
+    metadata = read_json(path)
+    if not isinstance(metadata, dict):
+        raise OffbenchError(f"{path} is damaged: not a table; record or download the dataset again")
+    return metadata
+
+
+def provenance(metadata: dict[str, Any]) -> dict[str, Any]:
+    """Return what offbench recorded about a dataset ({} for others' datasets)."""
+    ours = metadata.get(KEY)
+    return ours if isinstance(ours, dict) else {}
+
+
+class ContentHash:
+    """SHA-256 over the arrays of episodes in order: the same for the same data, whatever file holds them."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+
+    def add(self, observations: Array, actions: Array, rewards: Array, ends: tuple[bool, bool]) -> None:
+        """Take in one episode; the arrays count with their dtype and shape."""
+        for array in (observations, actions, rewards):
+            self._hash.update(f"{array.dtype.str}{array.shape}".encode())
+            self._hash.update(np.ascontiguousarray(array).data)
+        self._hash.update(bytes(ends))
+
+    def hexdigest(self) -> str:
+        """Return the hash of all episodes so far."""
+        return self._hash.hexdigest()
+
+
+@contextlib.contextmanager
+def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
+    """Hold a dataset id for writing; yields its folder.
+
+    Raises:
+        OffbenchError: the id is taken (and `overwrite` is not set), another process is recording it, or the
+            folder cannot be written.
+    """
+    path = path_of(dataset_id)
+    with disk_errors(str(path)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(path.parent / f".offbench-{path.name}.lock")
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            raise OffbenchError(f"{dataset_id} is being recorded by another process; wait for it") from None
+    try:
+        if path.exists() and not overwrite:
+            raise OffbenchError(f"{dataset_id} exists already; use --overwrite to replace it, or --id for another id")
+        yield path
+    finally:
+        lock.release()
+
+
+def write(path: Path, episodes: Iterable[Episode], spec: str, metadata: dict[str, Any], steps: int) -> str:
+    """Write episodes as a Minari HDF5 dataset at `path`, whole or not at all; return the content hash.
+
+    Args:
+        path: the folder of a claimed id; what is there is replaced at the last moment.
+        spec: the environment's EnvSpec as JSON.
+        metadata: Minari's fields; the content hash joins those under the key `offbench`.
+        steps: transitions to come, to see beforehand whether the disk has room.
+    """
+    env_spec = EnvSpec.from_json(spec)
+    aside = path.with_name(f".offbench-{path.name}.partial")
+    old = path.with_name(f".offbench-{path.name}.old")
+    with disk_errors(str(path)):
+        for stale in (aside, old):  # left by a process that was killed; the lock says none is at work
+            shutil.rmtree(stale, ignore_errors=True)
+        (aside / "data").mkdir(parents=True)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                storage = MinariStorage.new(aside / "data", env_spec=env_spec, data_format="hdf5")
+            _check_room(aside, storage, steps)
+            content = ContentHash()
+            storage.update_episodes(_buffers(episodes, storage.observation_space.dtype, content))
+            ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
+            storage.update_metadata(metadata | {KEY: ours})
+            if path.exists():
+                path.replace(old)
+            aside.replace(path)
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
+            shutil.rmtree(old, ignore_errors=True)
+    return content.hexdigest()
+
+
+def _buffers(episodes: Iterable[Episode], dtype: Any, content: ContentHash) -> Iterator[EpisodeBuffer]:
+    for episode in episodes:
+        observations = episode.observations.astype(dtype, copy=False)
+        ends = (episode.terminated, episode.truncated)
+        content.add(observations, episode.actions, episode.rewards, ends)
+        flags = np.zeros((2, len(episode)), bool)
+        flags[:, -1] = ends
+        yield EpisodeBuffer(
+            id=None,
+            seed=episode.seed if episode.seed >= 0 else None,
+            observations=observations,
+            actions=episode.actions,
+            rewards=episode.rewards,
+            terminations=flags[0],
+            truncations=flags[1],
+            infos=None,
+        )
+
+
+def _check_room(folder: Path, storage: Any, steps: int) -> None:
+    """Refuse to begin what the disk cannot hold (episodes of 100 steps assumed)."""
+    width = storage.observation_space.shape[0] * storage.observation_space.dtype.itemsize
+    width += storage.action_space.shape[0] * 4 + 10
+    need = steps * width + steps // 100 * BYTES_PER_EPISODE
+    free = shutil.disk_usage(folder).free
+    if free < need:
+        raise OffbenchError(
+            f"not enough room in {root()}: {need / 1e6:.0f} MB needed, {free / 1e6:.0f} MB free; "
+            "free some, set MINARI_DATASETS_PATH to another disk, or record fewer --steps"
+        )
