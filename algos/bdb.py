@@ -1,0 +1,187 @@
+"""BDB: "Combined Constraint on Behavior Cloning and Discriminator in Offline Reinforcement Learning".
+
+TD3+BC (td3_bc.py) whose constraint is shared by beta between cloning and a GAN discriminator D:
+
+    discriminator  loss = mean -log D(s, a) + mean -log(1 - D(s, pi(s)))                                  (eq. 16)
+    actor          loss = -lambda mean Q_1(s, pi(s)) + mean [beta (-log D(s, pi(s))) + (1 - beta) (pi(s) - a)^2]
+                                                                                                          (eq. 17)
+    adaptive beta  = min(1, 1 / Unc),  Unc = max_i Q_i(s, pi(s)) - min_i Q_i(s, pi(s)), detached     (Algorithm 2)
+
+D moves just before the actor, its actions pi(s) detached; it works on logits, -log D = softplus(-logit). With
+beta = 0 every number is TD3+BC's, bit for bit. Critics start in agreement, so Unc < 1 and the adaptive beta is
+near 1 at first: the published rule lets the discriminator alone hold the policy until Q has grown.
+Deviations: none known; the paper leaves open whether beta is a sample's or a batch's (`beta_scope`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from offbench.algorithm import Batch, Draw
+from offbench.networks import Network, Target
+from offbench.settings import setting
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of BDB (the paper's Tables 3 and 4)."""
+
+    alpha: float = setting(2.5, "weight of Q against the constraint: lambda = alpha / mean|Q1|", low=0, per_run=True)
+    beta: float | str = setting(
+        "adaptive",
+        "share of the discriminator in the constraint, or adaptive",
+        low=0,
+        high=1,
+        choices=("adaptive",),
+        per_run=True,
+    )
+    beta_scope: str = setting("sample", "one adaptive beta a sample or a batch", choices=("sample", "batch"))
+    critics: int = setting(2, "M, critics behind the target's minimum and the uncertainty", low=2)
+    discriminator_learning_rate: float = setting(3e-4, "Adam's learning rate of the discriminator", above=0)
+    discriminator_hidden: tuple[int, ...] = setting((64, 64), "hidden layers of the discriminator (tanh)", low=1)
+    discount: float = setting(0.99, "discount", low=0, high=1)
+    tau: float = setting(0.005, "Polyak rate of the targets", above=0, high=1)
+    policy_noise: float = setting(0.2, "std of the noise on target actions, in units of the largest action", low=0)
+    noise_clip: float = setting(0.5, "that noise is clipped to +- this", low=0)
+    policy_freq: int = setting(2, "updates of the critics for each of the actor and targets", low=1)
+    actor_learning_rate: float = setting(3e-4, "Adam's learning rate of the actor", above=0)
+    critic_learning_rate: float = setting(3e-4, "Adam's learning rate of the critics", above=0)
+    batch_size: int = setting(256, "transitions an update", low=1)
+    hidden: tuple[int, ...] = setting((256, 256), "hidden layers of actor and critics", low=1)
+    normalize: bool = setting(True, "normalise observations by the dataset's mean and std + 1e-3")
+
+
+def critic_loss(
+    critic: Network, critic_target: Target, actor_target: Target, batch: Batch, noise: Tensor, c: Any
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the critics' loss [runs], and what is logged."""
+    with torch.no_grad():
+        noise = (noise * c.policy_noise).clamp(-c.noise_clip, c.noise_clip)
+        next_actions = (actor_target(batch.next_observations)[0].tanh() + noise).clamp(-1, 1)
+        next_q = critic_target(batch.next_observations, next_actions).squeeze(-1).amin(0)
+        target = batch.rewards + c.discount * batch.masks * next_q
+    q = critic(batch.observations, batch.actions).squeeze(-1)  # [critics, runs, batch]
+    loss = (q - target).square().mean(-1).sum(0)
+    return loss, {"critic_loss": loss.detach(), "q_abs": q[0].detach().abs().mean(-1)}
+
+
+def discriminator_loss(discriminator: Network, actor: Network, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the discriminator's loss [runs], eq. 16: the data's actions are real, the policy's are not."""
+    with torch.no_grad():
+        pi = actor(batch.observations)[0].tanh()
+    real = discriminator(batch.observations, batch.actions)[0].squeeze(-1)
+    fake = discriminator(batch.observations, pi)[0].squeeze(-1)
+    loss = softplus(-real).mean(-1) + softplus(fake).mean(-1)
+    seen = {"d_real": real.detach().sigmoid().mean(-1), "d_fake": fake.detach().sigmoid().mean(-1)}
+    return loss, {"discriminator_loss": loss.detach()} | seen
+
+
+def uncertainty(critic: Network, batch: Batch, pi: Tensor, c: Any) -> Tensor:
+    """Return max_i Q_i - min_i Q_i over the M critics at (s, pi(s)), [runs, batch] (Algorithm 2)."""
+    with torch.no_grad():
+        q = critic(batch.observations, pi).squeeze(-1)
+        unc = q.amax(0) - q.amin(0)
+    return unc.mean(-1, keepdim=True).expand_as(unc) if c.beta_scope == "batch" else unc
+
+
+def actor_loss(
+    actor: Network, critic: Network, discriminator: Network, batch: Batch, c: Any
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the actor's loss [runs], eq. 17, and what is logged."""
+    pi = actor(batch.observations)[0].tanh()
+    q = critic.frozen(batch.observations, pi, copies=1)[0].squeeze(-1)  # Q1 alone: [runs, batch]
+    lambda_q = c.alpha / q.detach().abs().mean(-1) * q.mean(-1)
+    cloning = (pi - batch.actions).square().mean(-1)
+    adversarial = softplus(-discriminator.frozen(batch.observations, pi)[0].squeeze(-1))
+    unc = uncertainty(critic, batch, pi.detach(), c)
+    adaptive = (1 / unc).clamp(max=1)  # Unc = 0 gives 1
+    beta = torch.where(c.beta.isnan().unsqueeze(-1), adaptive, c.beta.unsqueeze(-1))  # [runs, batch]
+    loss = -lambda_q + (beta * adversarial + (1 - beta) * cloning).mean(-1)
+    logs = {"actor_loss": loss.detach(), "lambda_q": lambda_q.detach(), "bc": cloning.detach().mean(-1)}
+    low, median, high = beta.quantile(beta.new_tensor([0.05, 0.5, 0.95]), dim=-1)
+    logs |= {"adversarial": adversarial.detach().mean(-1), "uncertainty": unc.mean(-1), "beta": beta.mean(-1)}
+    return loss, logs | {"beta_5": low, "beta_50": median, "beta_95": high}
+
+
+class BDB:
+    """A stack of BDB runs."""
+
+    Config = Config
+
+    def __init__(
+        self,
+        config: Any,
+        observation_dim: int,
+        action_dim: int,
+        run_seeds: Sequence[int],
+        device: torch.device | str,
+    ) -> None:
+        c = self.config = config
+        self.action_dim = action_dim
+        sizes, inputs = c.hidden, observation_dim + action_dim
+        self.actor = Network(
+            (observation_dim, *sizes, action_dim),
+            run_seeds,
+            0,
+            learning_rate=c.actor_learning_rate,
+            device=device,
+        )
+        self.critic = Network(
+            (inputs, *sizes, 1),
+            run_seeds,
+            1,
+            learning_rate=c.critic_learning_rate,
+            copies=c.critics,
+            device=device,
+        )
+        self.discriminator = Network(
+            (inputs, *c.discriminator_hidden, 1),
+            run_seeds,
+            2,
+            learning_rate=c.discriminator_learning_rate,
+            activation="tanh",
+            device=device,
+        )
+        self.actor_target, self.critic_target = Target(self.actor), Target(self.critic)
+        self.learned = {
+            "actor": self.actor,
+            "critic": self.critic,
+            "discriminator": self.discriminator,
+            "actor_target": self.actor_target,
+            "critic_target": self.critic_target,
+        }
+
+    @property
+    def draws(self) -> dict[str, Draw]:
+        """One normal number for each target action."""
+        return {"target": Draw((self.config.batch_size, self.action_dim), "normal")}
+
+    def kind(self, step: int) -> str:
+        """The actor and the targets wait for every `policy_freq`-th update."""
+        return "critic+actor" if (step + 1) % self.config.policy_freq == 0 else "critic"
+
+    def update(self, batch: Batch, noise: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
+        """One update of every run."""
+        c = self.config
+        loss, logs = critic_loss(self.critic, self.critic_target, self.actor_target, batch, noise["target"], c)
+        self.critic.minimize(loss.sum())
+        if kind == "critic+actor":
+            loss, more = discriminator_loss(self.discriminator, self.actor, batch)
+            self.discriminator.minimize(loss.sum())
+            logs |= more
+            loss, more = actor_loss(self.actor, self.critic, self.discriminator, batch, c)
+            self.actor.minimize(loss.sum())
+            self.actor_target.follow(c.tau)
+            self.critic_target.follow(c.tau)
+            logs |= more
+        return logs
+
+    def policy(self, run: int) -> tuple[str, list[tuple[Tensor, Tensor]]]:
+        """Return the actor: tanh of its output."""
+        return "tanh", self.actor.layers(run)

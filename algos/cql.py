@@ -1,0 +1,204 @@
+"""CQL: Kumar et al., "Conservative Q-Learning for Offline Reinforcement Learning", NeurIPS 2020.
+
+Reference: the authors' code, github.com/aviralkumar2907/CQL, with the settings of the BDB paper's Table 5. SAC whose
+critics are pushed down where the policy or chance would act, and up on the data (CQL(H), importance-weighted):
+
+    critic       sum_i mean (Q_i(s, a) - y)^2 + alpha sum_i mean [ logsumexp_j (Q_i(s, a_j) - log w_j) - Q_i(s, a) ]
+                 y = r + discount (1 - terminated) min_i Q'_i(s', a'),  a' ~ pi(s'); no entropy in it
+                 a_j: N uniform (w = 0.5^dim), N ~ pi(s), N ~ pi(s'), each with its own density; all Q at s
+    actor        mean [ temperature log pi(a|s) - min_i Q_i(s, a) ],  a ~ pi(s)
+                 in the first `bc_steps` updates: mean [ temperature log pi(a|s) - log pi(data's action|s) ]
+    temperature  loss = -log(temperature) mean [ log pi(a|s) + target entropy ],  target entropy = -dim(A)
+
+Deviations: the actor sees the critics after their update, as in SB3 (the authors compute its loss just before);
+the actor has the critics' three hidden layers, as in their code (Table 5 gives its width alone).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from offbench.algorithm import Batch, Draw
+from offbench.networks import Learned, Network, Target
+from offbench.settings import setting
+
+LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+ATANH_CLIP = 0.999  # data actions at the bounds have no inverse tanh
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of CQL (the BDB paper's Table 5)."""
+
+    alpha: float = setting(10.0, "weight of the conservative penalty", low=0, per_run=True)
+    num_actions: int = setting(10, "actions of each of the three kinds in the log-sum-exp", low=1)
+    bc_steps: int = setting(40_000, "updates in which the actor clones the data first", low=0)
+    discount: float = setting(0.99, "discount", low=0, high=1)
+    tau: float = setting(0.005, "Polyak rate of the target critics", above=0, high=1)
+    actor_learning_rate: float = setting(3e-5, "Adam's learning rate of the actor and temperature", above=0)
+    critic_learning_rate: float = setting(3e-4, "Adam's learning rate of the critics", above=0)
+    batch_size: int = setting(256, "transitions an update", low=1)
+    hidden: tuple[int, ...] = setting((256, 256, 256), "hidden layers of actor and critics", low=1)
+    normalize: bool = setting(False, "normalise observations by the dataset's mean and std + 1e-3")
+
+
+def log_prob(mean: Tensor, log_std: Tensor, u: Tensor) -> Tensor:
+    """Return the log-density of tanh(u), u normal, summed over the last axis.
+
+    log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2u)) stays finite for any u.
+    """
+    normal = -0.5 * ((u - mean) / log_std.exp()).square() - log_std - 0.5 * math.log(2 * math.pi)
+    return (normal - 2 * (math.log(2) - u - softplus(-2 * u))).sum(-1)
+
+
+def distribution(actor: Network, observations: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and log std [runs, batch, act] of the normal before the tanh."""
+    mean, log_std = actor(observations)[0].chunk(2, -1)
+    return mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
+
+
+def sample(actor: Network, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Return actions [runs, n, batch, act] and their log-densities [runs, n, batch].
+
+    Args:
+        noise: [runs, n, batch, act], standard normal.
+    """
+    mean, log_std = (x.unsqueeze(1) for x in distribution(actor, observations))
+    u = mean + log_std.exp() * noise
+    return u.tanh(), log_prob(mean, log_std, u)
+
+
+def at_each(critic: Network, observations: Tensor, actions: Tensor) -> Tensor:
+    """Return Q [critics, runs, n, batch] of several actions [runs, n, batch, act] at the same observations."""
+    runs, n, batch, _ = actions.shape
+    repeated = observations.unsqueeze(1).expand(runs, n, batch, -1)
+    q = critic(repeated.reshape(runs, n * batch, -1), actions.reshape(runs, n * batch, -1))
+    return q.view(-1, runs, n, batch)
+
+
+def conservative_penalty(
+    critic: Network, actor: Network, batch: Batch, noise: Mapping[str, Tensor], q: Tensor
+) -> Tensor:
+    """Return mean [logsumexp_j (Q(s, a_j) - log w_j) - Q(s, a)] of each critic, [critics, runs]."""
+    with torch.no_grad():
+        here, here_log = sample(actor, batch.observations, noise["here"])
+        there, there_log = sample(actor, batch.next_observations, noise["there"])
+        uniform = noise["uniform"]
+        uniform_log = torch.full_like(here_log, uniform.shape[-1] * math.log(0.5))
+        actions = torch.cat([uniform, here, there], 1)
+        log_density = torch.cat([uniform_log, here_log, there_log], 1)
+    weighted = at_each(critic, batch.observations, actions) - log_density
+    return (weighted.logsumexp(2) - q).mean(-1)
+
+
+def critic_loss(
+    critic: Network, critic_target: Target, actor: Network, batch: Batch, noise: Mapping[str, Tensor], c: Any
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the critics' loss [runs], and what is logged."""
+    with torch.no_grad():
+        next_actions, _ = sample(actor, batch.next_observations, noise["target"])
+        next_q = critic_target(batch.next_observations, next_actions[:, 0]).squeeze(-1).amin(0)
+        target = batch.rewards + c.discount * batch.masks * next_q
+    q = critic(batch.observations, batch.actions).squeeze(-1)  # [critics, runs, batch]
+    td = (q - target).square().mean(-1).sum(0)
+    penalty = conservative_penalty(critic, actor, batch, noise, q).sum(0)
+    logs = {"critic_loss": td.detach(), "penalty": penalty.detach(), "q_abs": q[0].detach().abs().mean(-1)}
+    return td + c.alpha * penalty, logs
+
+
+def actor_loss(
+    actor: Network, critic: Network, temperature: Tensor, batch: Batch, noise: Tensor, cloning: bool
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the actor's loss [runs] (cloning in the warm-up), the log-density of its actions among the logs."""
+    mean, log_std = distribution(actor, batch.observations)
+    u = mean + log_std.exp() * noise[:, 0]
+    log_pi = log_prob(mean, log_std, u)
+    if cloning:
+        data = batch.actions.clamp(-ATANH_CLIP, ATANH_CLIP).atanh()
+        value = log_prob(mean, log_std, data)
+    else:
+        value = critic.frozen(batch.observations, u.tanh()).squeeze(-1).amin(0)
+    loss = (temperature.unsqueeze(-1) * log_pi - value).mean(-1)
+    return loss, {"actor_loss": loss.detach(), "log_pi": log_pi.detach().mean(-1)}
+
+
+class CQL:
+    """A stack of CQL runs."""
+
+    Config = Config
+
+    def __init__(
+        self,
+        config: Any,
+        observation_dim: int,
+        action_dim: int,
+        run_seeds: Sequence[int],
+        device: torch.device | str,
+    ) -> None:
+        c = self.config = config
+        self.action_dim = action_dim
+        self.actor = Network(
+            (observation_dim, *c.hidden, 2 * action_dim),
+            run_seeds,
+            0,
+            learning_rate=c.actor_learning_rate,
+            device=device,
+        )
+        self.critic = Network(
+            (observation_dim + action_dim, *c.hidden, 1),
+            run_seeds,
+            1,
+            learning_rate=c.critic_learning_rate,
+            copies=2,
+            device=device,
+        )
+        self.critic_target = Target(self.critic)
+        self.log_temperature = Learned(torch.zeros(1, len(run_seeds), 1, device=device), c.actor_learning_rate)
+        self.learned = {
+            "actor": self.actor,
+            "critic": self.critic,
+            "critic_target": self.critic_target,
+            "log_temperature": self.log_temperature,
+        }
+
+    @property
+    def draws(self) -> dict[str, Draw]:
+        """Normal numbers for every sampled action, uniform ones for the random actions."""
+        n, rest = self.config.num_actions, (self.config.batch_size, self.action_dim)
+        one, many = Draw((1, *rest), "normal"), Draw((n, *rest), "normal")
+        return {
+            "target": one,
+            "actor": one,
+            "here": many,
+            "there": many,
+            "uniform": Draw((n, *rest), "uniform"),
+        }
+
+    def kind(self, step: int) -> str:
+        """The actor clones first."""
+        return "cloning" if step < self.config.bc_steps else "sac"
+
+    def update(self, batch: Batch, noise: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
+        """One update of every run."""
+        c = self.config
+        loss, logs = critic_loss(self.critic, self.critic_target, self.actor, batch, noise, c)
+        self.critic.minimize(loss.sum())
+        log_temperature = self.log_temperature.flat[0, :, 0]  # [runs]
+        temperature = log_temperature.detach().exp()
+        loss, more = actor_loss(self.actor, self.critic, temperature, batch, noise["actor"], kind == "cloning")
+        self.actor.minimize(loss.sum())
+        target_entropy = -float(self.action_dim)
+        self.log_temperature.minimize(-(log_temperature * (more["log_pi"] + target_entropy)).sum())
+        self.critic_target.follow(c.tau)
+        return logs | more | {"temperature": temperature}
+
+    def policy(self, run: int) -> tuple[str, list[tuple[Tensor, Tensor]]]:
+        """Return the actor: mean and log std before the tanh."""
+        return "squashed_gaussian", self.actor.layers(run)

@@ -1,0 +1,133 @@
+"""What an algorithm is, and how one is found by name.
+
+    class Config            frozen dataclass of `setting`s: CLI flags, help, config.json
+    class Algorithm(config, observation_dim, action_dim, run_seeds, device)
+        draws               the random numbers of one update, by name
+        kind(step)          which sort of update comes at a step
+        update(batch, noise, kind) -> {name: [runs]}
+        learned             {name: Network}: all that a checkpoint keeps
+        policy(run)         the policy file's kind and layers
+
+Every tensor has the run axis first; runs of a stack share shapes and every setting that is not `per_run`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.metadata
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, cast
+
+import torch
+from torch import Tensor
+
+from offbench.errors import OffbenchError, unknown
+
+GROUP = "offbench.algos"
+
+
+class Batch(NamedTuple):
+    """Transitions of one update.
+
+    Attributes:
+        observations, next_observations: [runs, batch, obs], normalised if the settings say so.
+        actions: [runs, batch, act] in [-1, 1].
+        rewards: [runs, batch].
+        masks: [runs, batch], 1 - terminations: 0 where nothing is left to bootstrap from.
+    """
+
+    observations: Tensor
+    actions: Tensor
+    rewards: Tensor
+    next_observations: Tensor
+    masks: Tensor
+
+
+class Draw(NamedTuple):
+    """Random numbers of one update of one run: their shape and how they are distributed."""
+
+    shape: tuple[int, ...]
+    distribution: Literal["normal", "uniform"]  # uniform in [-1, 1]
+
+
+class Keeps(Protocol):
+    """Something whose tensors belong into a checkpoint (a network, a target, a temperature)."""
+
+    def tensors(self) -> dict[str, Tensor]: ...
+
+
+class Algorithm(Protocol):
+    """A stack of runs of one algorithm."""
+
+    Config: ClassVar[type]
+    learned: Mapping[str, Keeps]
+
+    def __init__(
+        self,
+        config: Any,
+        observation_dim: int,
+        action_dim: int,
+        run_seeds: Sequence[int],
+        device: torch.device | str,
+    ) -> None: ...
+
+    @property
+    def draws(self) -> dict[str, Draw]:
+        """The random numbers that each update gets, beside the batch."""
+        ...
+
+    def kind(self, step: int) -> str:
+        """Return which sort of update comes at `step` (from 0)."""
+        ...
+
+    def update(self, batch: Batch, noise: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
+        """Do one update in place; return what is logged, each [runs]."""
+        ...
+
+    def policy(self, run: int) -> tuple[str, list[tuple[Tensor, Tensor]]]:
+        """Return the policy file's kind and layers of one run."""
+        ...
+
+
+@functools.cache
+def _entry_points() -> dict[str, importlib.metadata.EntryPoint]:
+    return {point.name: point for point in importlib.metadata.entry_points(group=GROUP)}
+
+
+def algorithm_names() -> list[str]:
+    """Return the names of all installed algorithms, ours and third parties'."""
+    return sorted(_entry_points())
+
+
+def load_algorithm(name: str) -> type[Algorithm]:
+    """Return an algorithm's class by name. Raises OffbenchError if it is unknown or does not import."""
+    points = _entry_points()
+    if name not in points:
+        raise unknown("algorithm", name, points)
+    try:
+        return cast(type[Algorithm], points[name].load())
+    except (ImportError, AttributeError) as error:
+        raise OffbenchError(f"algorithm {name!r} ({points[name].value}) does not import: {error}") from error
+
+
+def stack_configs(configs: Sequence[Any], device: torch.device | str) -> Any:
+    """Return one config for a stack: `per_run` settings as tensors [runs], the others as they are.
+
+    A word among numbers (beta = "adaptive") becomes NaN in the tensor.
+
+    Raises:
+        OffbenchError: the runs differ in a setting that cannot differ within a stack.
+    """
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(configs[0]):
+        column = [getattr(config, field.name) for config in configs]
+        if field.metadata.get("per_run"):
+            numbers = [float("nan") if isinstance(value, str) else float(value) for value in column]
+            values[field.name] = torch.tensor(numbers, dtype=torch.float32, device=device)
+        elif any(value != column[0] for value in column):
+            raise OffbenchError(f"runs of one stack cannot differ in {field.name}")
+        else:
+            values[field.name] = column[0]
+    return SimpleNamespace(**values)

@@ -1,0 +1,175 @@
+"""`train`: from an algorithm's name, datasets, settings and seeds to a stack of runs."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from offbench import transitions
+from offbench.algorithm import load_algorithm
+from offbench.errors import OffbenchError
+from offbench.provenance import hardware, versions, warn_other_physics
+from offbench.recipes import d4rl_constants
+from offbench.runs import Run, run_folder, settings_dict, variant
+from offbench.settings import check, fields
+from offbench.training import Member, Schedule, Trainer
+from offbench.transitions import Transitions
+from offbench.workers import cores
+
+
+def train(
+    algorithm: str,
+    dataset: str | Sequence[str],
+    *,
+    seeds: int | Sequence[int] = 0,
+    steps: int = 1_000_000,
+    eval_every: int = 5_000,
+    eval_episodes: int = 10,
+    device: str = "auto",
+    workers: int | None = None,
+    runs: str | Path = "runs",
+    command: str = "",
+    **settings: Any,
+) -> list[Path]:
+    """Train runs of one algorithm as one stack, going on from their newest checkpoints.
+
+    Args:
+        algorithm: a registered name: td3_bc, bdb, cql, or a third party's.
+        dataset: one id of a local Minari dataset, or several of one environment.
+        seeds: one seed or several; each run's randomness depends on its own seed alone.
+        steps: updates of each run.
+        eval_every, eval_episodes: every so many updates, so many episodes of the deterministic policy.
+        device: auto, cpu, cuda or cuda:N.
+        workers: evaluation processes beside the training (default: all cores but one).
+        runs: the folder of all run directories.
+        command: what the user typed, for the run's config.json.
+        settings: the algorithm's own (`offbench train bdb --help`); a setting that may differ between the runs
+            of a stack also takes a list, e.g. `beta=[0.25, 0.5, "adaptive"]`.
+
+    Returns:
+        The runs' directories: datasets x settings x seeds.
+
+    Raises:
+        OffbenchError: anything that the user can mend, said in one line.
+    """
+    kind = load_algorithm(algorithm)
+    configs = [kind.Config(**values) for values in _grid(kind.Config, settings, algorithm)]
+    seed_list = [seeds] if isinstance(seeds, int) else list(seeds)
+    _check_numbers(seed_list, steps, eval_every, eval_episodes, workers)
+    place = pick_device(device)
+    datasets = [transitions.load(name) for name in ([dataset] if isinstance(dataset, str) else dataset)]
+    schedule = Schedule(steps, eval_every, eval_episodes, place, workers or max(1, cores() - 1))
+    members = []
+    for data, config, seed in itertools.product(datasets, configs, seed_list):
+        warn_other_physics(data.dataset_id, data.metadata.get("offbench", {}).get("versions", {}))
+        run = Run(run_folder(Path(runs), data.dataset_id, algorithm, variant(config), seed))
+        members.append(Member(run, seed, config, data, references(data)))
+    for member in members:
+        member.run.claim(_config(algorithm, member, schedule, command))
+    title = f"{algorithm} on {datasets[0].dataset_id}" + (f" ({len(members)} runs)" if len(members) > 1 else "")
+    with _threads(place):
+        Trainer(kind, members, schedule, title).train()
+    return [member.run.folder for member in members]
+
+
+def _grid(cls: type, settings: Mapping[str, Any], algorithm: str) -> Iterator[dict[str, Any]]:
+    """Yield the settings of each config: the product of all lists given."""
+    from offbench.errors import unknown
+
+    known, columns = fields(cls), []
+    for name, value in settings.items():
+        if name not in known:
+            raise unknown(f"setting of {algorithm}", name, known)
+        several = isinstance(value, list | tuple) and known[name].metadata.get("per_run")
+        values = list(value) if several else [value]
+        if not values:
+            raise OffbenchError(f"{algorithm}: {name} got an empty list")
+        columns.append([(name, check(cls, name, item, algorithm)) for item in values])
+    for row in itertools.product(*columns):
+        yield dict(row)
+
+
+def _check_numbers(seeds: Sequence[int], steps: int, eval_every: int, eval_episodes: int, workers: int | None) -> None:
+    if not seeds or any(not isinstance(seed, int) or seed < 0 for seed in seeds) or len(set(seeds)) < len(seeds):
+        raise OffbenchError(f"seeds must be different whole numbers from 0, not {list(seeds)}")
+    given = {
+        "steps": steps,
+        "eval_every": eval_every,
+        "eval_episodes": eval_episodes,
+        "workers": workers or 1,
+    }
+    for name, value in given.items():
+        if not isinstance(value, int) or value < 1:
+            raise OffbenchError(f"{name} must be a whole number from 1, not {value}")
+
+
+def pick_device(device: str) -> str:
+    """Return the device to train on: `auto` takes a GPU if there is one.
+
+    Raises:
+        OffbenchError: not a device, or one that this machine lacks.
+    """
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    kind, _, index = device.partition(":")
+    if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
+        raise OffbenchError(f"device must be auto, cpu, cuda or cuda:N, not {device!r}")
+    if kind == "cuda" and (not torch.cuda.is_available() or int(index or 0) >= torch.cuda.device_count()):
+        found = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        raise OffbenchError(
+            f"no device {device}: PyTorch {torch.__version__} sees {found} GPUs here; use --device cpu"
+        )
+    return device
+
+
+def references(data: Transitions) -> tuple[float, float] | None:
+    """Return a dataset's own reference scores (random, expert), None if it has none."""
+    low, high = data.metadata.get("ref_min_score"), data.metadata.get("ref_max_score")
+    if low is None or high is None or not float(high) > float(low):
+        return None
+    return float(low), float(high)
+
+
+def _config(algorithm: str, member: Member, schedule: Schedule, command: str) -> dict[str, Any]:
+    """Return the run's config.json: all that is needed to repeat it, and to score it without its dataset."""
+    data = member.data
+    constants = d4rl_constants(data.env_id)
+    return {
+        "format": "offbench-run-1",
+        "algorithm": algorithm,
+        "variant": variant(member.config),
+        "settings": settings_dict(member.config),
+        "dataset": data.dataset_id,
+        "dataset_sha256": data.content,
+        "seed": member.seed,
+        "steps": schedule.steps,
+        "eval_every": schedule.eval_every,
+        "eval_episodes": schedule.eval_episodes,
+        "references": {
+            "dataset": list(member.references) if member.references else None,
+            "d4rl": list(constants) if constants else None,
+        },
+        "env_id": data.env_id,
+        "env_spec": data.env_spec,
+        "device": schedule.device,
+        "command": command,
+        "versions": versions(),
+        **hardware(),
+    }
+
+
+@contextmanager
+def _threads(device: str) -> Iterator[None]:
+    """Train on one thread: two runs in two processes beat one run on two threads."""
+    before = torch.get_num_threads()
+    if device == "cpu":
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,131 @@
+"""Stacked networks: every parameter of one network of all runs lies in one flat tensor.
+
+    flat [copies, runs, P]          copies: 1 actor, or the M critics of a run
+      = W0 [.., in, h] | b0 [.., h] | W1 [.., h, h] | b1 [.., h] | ...        (x @ W + b)
+
+One batched matrix product a layer serves all copies and runs, and Adam and Polyak are one pass over one
+tensor. Runs share nothing, so the gradient of the runs' summed losses is each run's own gradient.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from offbench import seeds
+from offbench.seeds import Purpose
+
+ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
+
+
+class Learned:
+    """A flat tensor [copies, runs, P] that Adam moves. Runs are axis 1, in every tensor of `tensors()`."""
+
+    def __init__(self, flat: Tensor, learning_rate: float) -> None:
+        self.flat = flat.requires_grad_()
+        on_gpu = flat.is_cuda
+        self.optimizer = torch.optim.Adam([flat], lr=learning_rate, fused=True, capturable=on_gpu)
+        self.state: dict[str, Tensor] = {
+            # made here and not at the first step, so that a checkpoint has the same tensors at any time
+            "step": torch.zeros((), dtype=torch.float32, device=flat.device),
+            "exp_avg": torch.zeros_like(flat, requires_grad=False),
+            "exp_avg_sq": torch.zeros_like(flat, requires_grad=False),
+        }
+        self.optimizer.state[flat] = self.state
+
+    def minimize(self, loss: Tensor, retain_graph: bool = False) -> None:
+        """Take one Adam step down the gradient of `loss` (runs summed), for these parameters alone."""
+        (self.flat.grad,) = torch.autograd.grad(loss, [self.flat], retain_graph=retain_graph)
+        self.optimizer.step()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return what a checkpoint keeps, each [copies, runs, P] but for the step count."""
+        return {"flat": self.flat.detach(), **self.state}
+
+
+class Network(Learned):
+    """Multilayer perceptrons of one shape, `copies` for each run, with PyTorch's default initial weights.
+
+    Args:
+        sizes: widths of all layers, inputs first.
+        run_seeds: one seed a run; a run's weights depend on its seed and on `index` alone.
+        index: tells an algorithm's networks apart.
+    """
+
+    def __init__(
+        self,
+        sizes: Sequence[int],
+        run_seeds: Sequence[int],
+        index: int,
+        *,
+        learning_rate: float,
+        copies: int = 1,
+        activation: str = "relu",
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.sizes, self.copies, self.runs = tuple(sizes), copies, len(run_seeds)
+        self.activation = ACTIVATIONS[activation]
+        self._shapes = list(itertools.pairwise(self.sizes))
+        self._splits = [n for i, o in self._shapes for n in (i * o, o)]
+        flat = np.stack([[self._initial(seed, index, copy) for seed in run_seeds] for copy in range(copies)])
+        super().__init__(torch.from_numpy(flat).to(device), learning_rate)
+
+    def _initial(self, seed: int, index: int, copy: int) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+        """Draw one network: U(-1/sqrt(fan_in), 1/sqrt(fan_in)) for weights and biases, as torch.nn.Linear."""
+        rng = seeds.generator(seed, Purpose.WEIGHTS, index, copy)
+        bounds = [1 / math.sqrt(i) for i, o in self._shapes for _ in range(2)]
+        parts = [rng.uniform(-b, b, n) for b, n in zip(bounds, self._splits, strict=True)]
+        return np.concatenate(parts).astype(np.float32)
+
+    def __call__(self, *inputs: Tensor) -> Tensor:
+        """Return the outputs [copies, runs, batch, out] for inputs [runs, batch, dim], concatenated."""
+        return self.forward(self.flat, *inputs)
+
+    def frozen(self, *inputs: Tensor, copies: int | None = None) -> Tensor:
+        """Like a call, with no gradient to the weights; `copies` takes the first few copies alone."""
+        return self.forward(self.flat.detach()[:copies], *inputs)
+
+    def forward(self, flat: Tensor, *inputs: Tensor) -> Tensor:
+        """Return the outputs [copies, runs, batch, out] of the networks in `flat`."""
+        x = torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
+        copies, (runs, batch, width) = flat.shape[0], x.shape
+        if copies > 1:
+            x = x.expand(copies, runs, batch, width).reshape(copies * runs, batch, width)
+        parts = iter(torch.split(flat.reshape(copies * runs, -1), self._splits, dim=1))
+        last = len(self._shapes) - 1
+        for i, (fan_in, fan_out) in enumerate(self._shapes):
+            weight = next(parts).view(-1, fan_in, fan_out)
+            x = torch.baddbmm(next(parts).unsqueeze(1), x, weight)
+            if i < last:
+                x = self.activation(x)
+        return x.view(copies, runs, batch, -1)
+
+    def layers(self, run: int) -> list[tuple[Tensor, Tensor]]:
+        """Return (weight [in, out], bias [out]) of each layer of one run's first copy, on the CPU."""
+        parts = iter(torch.split(self.flat.detach()[0, run].cpu(), self._splits))
+        return [(next(parts).view(i, o).clone(), next(parts).clone()) for i, o in self._shapes]
+
+
+class Target:
+    """A slowly following copy of a network."""
+
+    def __init__(self, source: Network) -> None:
+        self.source = source
+        self.flat = source.flat.detach().clone()
+
+    def __call__(self, *inputs: Tensor) -> Tensor:
+        """Return the copy's outputs [copies, runs, batch, out]."""
+        return self.source.forward(self.flat, *inputs)
+
+    def follow(self, tau: float) -> None:
+        """Polyak: target <- (1 - tau) target + tau source."""
+        self.flat.lerp_(self.source.flat.detach(), tau)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return what a checkpoint keeps."""
+        return {"flat": self.flat}

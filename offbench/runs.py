@@ -1,0 +1,153 @@
+"""Run directories: plain files that a person can read, and that `normalize` and `report` need nothing beside.
+
+runs/<dataset>/<algorithm>/<variant>/seed-<n>/
+    config.json           settings, dataset and its references, seed, versions, command
+    evaluations.csv       step, episode, return, length: every evaluation episode
+    losses.csv            step and the mean of each logged quantity since the row before
+    policy.safetensors    the policy at the last checkpoint
+    checkpoint-*.safetensors   the newest two; the same command goes on from there
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from offbench.errors import OffbenchError
+from offbench.files import csv_bytes, read_json, write_bytes, write_json
+
+EVALUATION_COLUMNS = ("step", "episode", "return", "length")
+MUST_MATCH = ("algorithm", "settings", "dataset", "dataset_sha256", "seed", "eval_every", "eval_episodes")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run's directory."""
+
+    folder: Path
+
+    @property
+    def config_path(self) -> Path:
+        """Settings and provenance."""
+        return self.folder / "config.json"
+
+    @property
+    def policy_path(self) -> Path:
+        """The policy at the last checkpoint."""
+        return self.folder / "policy.safetensors"
+
+    @property
+    def evaluations_path(self) -> Path:
+        """Every evaluation episode."""
+        return self.folder / "evaluations.csv"
+
+    def config(self) -> dict[str, Any]:
+        """Read config.json. Raises OffbenchError if it is missing or damaged."""
+        config = read_json(self.config_path)
+        if not isinstance(config, dict):
+            raise OffbenchError(f"{self.config_path} is damaged: not a table")
+        return config
+
+    def claim(self, config: Mapping[str, Any]) -> None:
+        """Write config.json, or check that the run in this directory is the same one.
+
+        Raises:
+            OffbenchError: another run lives here.
+        """
+        if self.config_path.exists():
+            known = self.config()
+            for key in MUST_MATCH:
+                if known.get(key) != config[key]:
+                    raise OffbenchError(
+                        f"{self.folder} holds a run with {key} {known.get(key)!r}, not {config[key]!r}; "
+                        "delete it or give another --runs"
+                    )
+            config = {**known, "steps": max(int(config["steps"]), int(known["steps"]))}
+        write_json(self.config_path, config)
+
+    def evaluations(self) -> dict[int, list[tuple[float, int]]]:
+        """Return {step: [(return, length) of each episode]} in order of steps; {} if there are none yet.
+
+        Raises:
+            OffbenchError: the file is damaged.
+        """
+        if not self.evaluations_path.exists():
+            return {}
+        found: dict[int, list[tuple[float, int]]] = {}
+        try:
+            with open(self.evaluations_path, newline="", encoding="utf-8") as file:
+                reader = csv.DictReader(file, strict=True)
+                if tuple(reader.fieldnames or ()) != EVALUATION_COLUMNS:
+                    raise ValueError(f"its columns are {reader.fieldnames}")
+                for row in reader:
+                    value = float(row["return"])
+                    if not math.isfinite(value):
+                        raise ValueError(f"a return is {value}")
+                    found.setdefault(int(row["step"]), []).append((value, int(row["length"])))
+        except (OSError, ValueError, TypeError, csv.Error) as error:
+            raise OffbenchError(f"{self.evaluations_path} is damaged: {error}; delete the run to repeat it") from None
+        return dict(sorted(found.items()))
+
+    def write_evaluations(self, evaluations: Mapping[int, list[tuple[float, int]]]) -> None:
+        """Replace evaluations.csv."""
+        rows = (
+            (step, i, repr(value), length)
+            for step, episodes in sorted(evaluations.items())
+            for i, (value, length) in enumerate(episodes)
+        )
+        write_bytes(self.evaluations_path, csv_bytes(EVALUATION_COLUMNS, rows))
+
+    def write_losses(self, rows: list[dict[str, float]]) -> None:
+        """Replace losses.csv; a quantity that was not logged in a row stays empty."""
+        columns = list(dict.fromkeys(key for row in rows for key in row))
+        lines = ([_short(row.get(key, "")) for key in columns] for row in rows)
+        write_bytes(self.folder / "losses.csv", csv_bytes(columns, lines))
+
+    def losses(self) -> list[dict[str, float]]:
+        """Read losses.csv ([] if there is none)."""
+        path = self.folder / "losses.csv"
+        if not path.exists():
+            return []
+        with open(path, newline="", encoding="utf-8") as file:
+            return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file)]
+
+
+def _short(value: Any) -> Any:
+    return f"{value:.6g}" if isinstance(value, float) else value
+
+
+def find_runs(root: Path) -> list[Run]:
+    """Return all runs below a folder, in order of their paths."""
+    return [Run(path.parent) for path in sorted(root.rglob("config.json"))]
+
+
+def run_folder(root: Path, dataset_id: str, algorithm: str, variant: str, seed: int) -> Path:
+    """Return runs/<dataset>/<algorithm>/<variant>/seed-<n>."""
+    return root / dataset_id / algorithm / variant / f"seed-{seed}"
+
+
+def variant(config: Any) -> str:
+    """Name a config by the settings that differ from their defaults: `default` or `alpha=1,beta=0.5`."""
+    parts = []
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if value != field.default:
+            parts.append(f"{field.name}={_word(value)}")
+    return ",".join(parts) or "default"
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "x".join(str(item) for item in value)
+    return f"{value:g}" if isinstance(value, float) else str(value).lower()
+
+
+def settings_dict(config: Any) -> dict[str, Any]:
+    """Return a config as JSON has it (tuples become lists)."""
+    values: Iterable[tuple[str, Any]] = dataclasses.asdict(config).items()
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in values}

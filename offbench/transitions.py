@@ -1,0 +1,207 @@
+"""Transitions: any Minari dataset with Box spaces as flat float32 arrays, converted once and then mapped.
+
+episode 0: o o o o      observations [N + E, obs]   every episode's T + 1 rows, end to end
+episode 1: o o o        rows [N]                    the row of each transition's observation
+           s s s.       next observation = row + 1  so nothing is stored twice
+
+actions [N, act] in [-1, 1]   rewards [N]   masks [N] = 1 - terminations   ends [E]: transitions up to each
+episode's end   returns [E]
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from filelock import FileLock
+
+from offbench import dataset
+from offbench.errors import OffbenchError
+from offbench.files import disk_errors, write_json
+from offbench.policy import Array
+from offbench.progress import Progress
+from offbench.recipes import box
+
+ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
+CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding are worth a warning
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """A dataset as flat arrays, mapped from the cache (see the module's drawing)."""
+
+    dataset_id: str
+    content: str
+    observations: Array
+    rows: Array
+    actions: Array
+    rewards: Array
+    masks: Array
+    ends: Array
+    returns: Array
+    low: Array
+    high: Array
+    metadata: dict[str, Any]
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    @property
+    def env_spec(self) -> str | None:
+        """The environment to evaluate in, as EnvSpec JSON; None if the dataset does not name one."""
+        return self.metadata.get("eval_env_spec") or self.metadata.get("env_spec")
+
+    @property
+    def env_id(self) -> str:
+        """The environment's id, for the policy file; empty if the dataset does not name one."""
+        return str(json.loads(self.env_spec).get("id", "")) if self.env_spec else ""
+
+    def normalizer(self) -> tuple[Array, Array]:
+        """Return mean and std + 1e-3 of the transitions' observations, [obs] float32, as TD3+BC's authors do."""
+        count, dim = len(self), self.observations.shape[1]
+        total, square = np.zeros(dim), np.zeros(dim)
+        for first in range(0, count, 100_000):
+            part = self.observations[self.rows[first : first + 100_000]].astype(np.float64)
+            total += part.sum(0)
+        mean = total / count
+        for first in range(0, count, 100_000):
+            part = self.observations[self.rows[first : first + 100_000]].astype(np.float64)
+            square += ((part - mean) ** 2).sum(0)
+        return mean.astype(np.float32), (np.sqrt(square / count) + 1e-3).astype(np.float32)
+
+
+def load(dataset_id: str) -> Transitions:
+    """Return a local Minari dataset as flat arrays.
+
+    Raises:
+        OffbenchError: no such dataset, spaces other than flat Boxes, NaN or infinite numbers, wrong shapes,
+            damaged files.
+    """
+    metadata = dataset.read_metadata(dataset_id)
+    data = _open(dataset_id)
+    observation_space = box(data.observation_space, f"{dataset_id}: observations")
+    action_space = box(data.action_space, f"{dataset_id}: actions")
+    if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
+        raise OffbenchError(f"{dataset_id}: the action space must be bounded to be scaled, not {action_space}")
+    folder = cache() / _key(dataset_id, metadata)
+    with disk_errors(str(folder)):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder.with_name(f"{folder.name}.lock")):
+            if not (folder / "meta.json").exists():
+                _convert(data, dataset_id, observation_space, action_space, folder)
+    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ARRAYS}
+    content = json.loads((folder / "meta.json").read_text())["content_sha256"]
+    return Transitions(dataset_id, content, **arrays, low=action_space.low, high=action_space.high, metadata=metadata)
+
+
+def cache() -> Path:
+    """Return the folder of converted datasets: $OFFBENCH_CACHE, else ~/.cache/offbench."""
+    path = os.environ.get("OFFBENCH_CACHE")
+    if path:
+        return Path(path)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "offbench"
+
+
+def _key(dataset_id: str, metadata: dict[str, Any]) -> str:
+    """Return the cache's name for a dataset: it changes with the content and with the files."""
+    folder = dataset.path_of(dataset_id) / "data"
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    seen = [(str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+    content = dataset.provenance(metadata).get("content_sha256")
+    text = json.dumps([2, dataset_id, content, str(folder), seen])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _open(dataset_id: str) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import minari
+
+        try:
+            return minari.MinariDataset(dataset.path_of(dataset_id) / "data")
+        except Exception as error:  # Minari, h5py and JSON each raise their own kinds for damaged files
+            raise OffbenchError(f"{dataset_id} cannot be read: {error}; record or download it again") from error
+
+
+def _convert(data: Any, dataset_id: str, observations: gym.spaces.Box, actions: gym.spaces.Box, folder: Path) -> None:
+    """Read every episode once and write the arrays; meta.json comes last, then the folder gets its name."""
+    columns: dict[str, list[Array]] = {name: [] for name in ("observations", "actions", "rewards", "masks")}
+    content, lengths, returns = hashlib.sha256(), [], []
+    with Progress(int(data.total_steps), f"converting {dataset_id}") as progress:
+        for episode in _episodes(data, dataset_id):
+            flat = _episode_arrays(episode, observations, actions, f"{dataset_id}, episode {episode.id}")
+            for name, array in flat.items():
+                content.update(array.tobytes())
+                columns[name].append(array)
+            lengths.append(len(flat["rewards"]))
+            returns.append(float(np.sum(episode.rewards, dtype=np.float64)))
+            progress.to(progress.done + lengths[-1])
+    if not lengths:
+        raise OffbenchError(f"{dataset_id} has no episodes; record it again")
+    arrays = {name: np.concatenate(parts) for name, parts in columns.items()}
+    arrays["actions"] = _scaled(arrays["actions"], actions, dataset_id)
+    ends = np.cumsum(lengths)
+    # each earlier episode put one extra observation row (its last) before this transition
+    arrays["rows"] = np.arange(ends[-1]) + np.repeat(np.arange(len(lengths)), lengths)
+    arrays |= {"ends": ends, "returns": np.array(returns)}
+    aside = folder.with_name(f".{folder.name}.{os.getpid()}")
+    aside.mkdir()
+    try:
+        for name in ARRAYS:
+            np.save(aside / f"{name}.npy", arrays[name], allow_pickle=False)
+        write_json(aside / "meta.json", {"dataset_id": dataset_id, "content_sha256": content.hexdigest()})
+        shutil.rmtree(folder, ignore_errors=True)
+        aside.replace(folder)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _episodes(data: Any, dataset_id: str) -> Iterator[Any]:
+    try:
+        yield from data.iterate_episodes()
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        raise OffbenchError(f"{dataset_id} is damaged: {error}; record or download it again") from error
+
+
+def _episode_arrays(
+    episode: Any, observations: gym.spaces.Box, actions: gym.spaces.Box, where: str
+) -> dict[str, Array]:
+    """Return one episode's arrays as float32, checked: shapes, T + 1 observations, finite numbers."""
+    steps = len(episode.rewards)
+    shapes = {
+        "observations": (steps + 1, *observations.shape),
+        "actions": (steps, *actions.shape),
+        "rewards": (steps,),
+        "terminations": (steps,),
+    }
+    for name, shape in shapes.items():
+        found = np.shape(getattr(episode, name))
+        if found != shape or not steps:
+            raise OffbenchError(f"{where}: {name} have shape {found}, expected {shape}; the dataset is damaged")
+    flat = {name: np.asarray(getattr(episode, name), np.float32) for name in ("observations", "actions", "rewards")}
+    for name, array in flat.items():
+        if not np.isfinite(array).all():
+            raise OffbenchError(f"{where}: {name} hold NaN or infinite numbers; filter them out of the dataset")
+    flat["masks"] = 1.0 - np.asarray(episode.terminations, np.float32)
+    return flat
+
+
+def _scaled(actions: Array, space: gym.spaces.Box, dataset_id: str) -> Array:
+    """Return actions scaled from the space's bounds to [-1, 1]; what lies outside is clipped, and said."""
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    scaled = 2.0 * (actions - low) / (high - low) - 1.0
+    outside = int((np.abs(scaled) > 1 + CLIP_TOLERANCE).any(1).sum())
+    if outside:
+        print(f"offbench: warning: {dataset_id}: {outside} actions out of bounds were clipped", file=sys.stderr)
+    return np.clip(scaled, -1, 1).astype(np.float32)
