@@ -1,0 +1,115 @@
+"""`evaluate`: play a run or a policy file in its environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offbench.errors import OffbenchError
+from offbench.policy import Policy, load_policy
+from offbench.recipes import d4rl_constants, env_spec, load_recipe
+from offbench.rollout import Rollouts, make_env, result
+from offbench.runs import Run
+from offbench.scores import interval, normalize
+from offbench.seeds import Purpose
+from offbench.workers import default_workers
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Returns of some episodes of one policy.
+
+    Attributes:
+        returns, lengths: of each episode.
+        scores: mean normalised score by reference ("dataset", "d4rl"), those that are known.
+    """
+
+    policy: str
+    env_id: str
+    returns: list[float]
+    lengths: list[int]
+    scores: dict[str, float]
+
+    def lines(self) -> list[str]:
+        """Return the evaluation as text."""
+        mean, low, high = interval(self.returns)
+        lines = [
+            f"{self.policy} in {self.env_id}: {len(self.returns)} episodes",
+            f"return {mean:.1f} (95% interval {low:.1f} to {high:.1f}), std {np.std(self.returns):.1f}, "
+            f"length {np.mean(self.lengths):.0f}",
+        ]
+        names = {"dataset": "the dataset's own reference", "d4rl": "D4RL's constants"}
+        return lines + [f"normalized score {score:.1f} ({names[key]})" for key, score in self.scores.items()]
+
+
+def evaluate(
+    path: str | Path,
+    *,
+    env: str | None = None,
+    episodes: int = 10,
+    seed: int = 0,
+    stochastic: bool = False,
+    workers: int | None = None,
+) -> Evaluation:
+    """Play episodes of a run's policy, or of a policy file.
+
+    Args:
+        path: a run directory, or a policy file (.safetensors).
+        env: a recipe's name or file, instead of the environment that the run or policy names.
+        seed: of the episodes.
+        stochastic: sample actions (policies that can) instead of taking the mode.
+        workers: processes (default: one a core).
+
+    Raises:
+        OffbenchError: no run or policy there, or it does not fit the environment.
+    """
+    if episodes < 1:
+        raise OffbenchError(f"episodes must be at least 1, not {episodes}")
+    path = Path(path)
+    config: Mapping[str, Any] = {}
+    if path.is_dir():
+        run = Run(path)
+        config = run.config()
+        if not run.policy_path.exists():
+            raise OffbenchError(f"{path} has no policy yet; train it to its first checkpoint")
+        policy = load_policy(run.policy_path)
+    else:
+        policy = load_policy(path)
+    spec = _spec(policy, config, env)
+    _check_fits(policy, spec, path)
+    if stochastic and not policy.stochastic:
+        raise OffbenchError(f"{path} is a deterministic policy; leave out --stochastic")
+    workers = default_workers(workers)
+    with Rollouts(spec, workers if workers > 1 else 0) as rollouts:
+        future = rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 2), episodes, not stochastic)
+        outcomes = result(future)
+    returns = [outcome.ret for outcome in outcomes]
+    known = config.get("references") or {"d4rl": d4rl_constants(policy.env_id)}
+    scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in known.items() if pair}
+    return Evaluation(str(path), policy.env_id, returns, [o.length for o in outcomes], scores)
+
+
+def _spec(policy: Policy, config: Mapping[str, Any], env: str | None) -> str:
+    if env is not None:
+        return load_recipe(env).env_spec()
+    known = config.get("env_spec")
+    if isinstance(known, str):
+        return known
+    if not policy.env_id:
+        raise OffbenchError("the policy names no environment; give one with --env")
+    return env_spec(policy.env_id)
+
+
+def _check_fits(policy: Policy, spec: str, path: Path) -> None:
+    env = make_env(spec)
+    shapes = (env.observation_space.shape, env.action_space.shape)
+    env.close()
+    if shapes != (policy.observation_mean.shape, policy.low.shape):
+        raise OffbenchError(
+            f"{path} takes observations {policy.observation_mean.shape} and gives actions {policy.low.shape}; "
+            f"the environment has {shapes[0]} and {shapes[1]}: give the right one with --env"
+        )

@@ -1,0 +1,276 @@
+"""The command line: parse, call, print. Everything it does is a function of the package."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+from offbench.errors import OffbenchError, unknown
+
+COMMANDS = {
+    "collect": "record a dataset: random, medium, medium-replay, medium-expert, expert, or a fraction",
+    "train": "train an algorithm on a dataset, with evaluations as it goes",
+    "normalize": "the score table of all runs, or the scores of given returns",
+    "evaluate": "play a run's policy, or a policy file",
+    "behaviour": "train an environment's behaviour agent (SAC) and build its ladder",
+    "list": "environments, levels, algorithms and local datasets",
+    "show": "what is in a dataset",
+}
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose refusals are one line and exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise the refusal as the error that `main` prints."""
+        raise OffbenchError(f"{message} (see `{self.prog} --help`)")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run one command; exit with 0, with 2 for a problem the user can mend, with 130 after Ctrl-C."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        _run(words)
+    except OffbenchError as error:
+        print(f"offbench: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("\noffbench: stopped; the same command goes on from the last checkpoint", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:  # the reader of a pipe (`| head`) has left
+        sys.stderr.close()
+        sys.exit(0)
+
+
+def _run(words: list[str]) -> None:
+    parser = Parser(prog="offbench", description="Offline-RL datasets and benchmarks.")
+    parser.add_argument("--version", action="version", version=_version())
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
+    name = next((word for word in words if not word.startswith("-")), None)
+    if name is not None and name not in COMMANDS:
+        raise unknown("command", name, COMMANDS)
+    for command, help_ in COMMANDS.items():
+        sub = commands.add_parser(command, help=help_, description=help_[0].upper() + help_[1:] + ".")
+        if command == name:  # only the command that runs pays for its arguments
+            ADD[command](sub, words[words.index(name) + 1 :])
+    arguments = vars(parser.parse_args(words))
+    if arguments.pop("command") is None:
+        parser.print_help()
+        return
+    run: Callable[..., None] = arguments.pop("run")
+    run(**arguments)
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return f"offbench {version('offbench')}"
+
+
+def _collect(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("env", metavar="ENV", help="a shipped recipe (see `offbench list`) or a recipe file")
+    parser.add_argument("--level", default="medium", help="a level or a fraction such as 0.6 (default: medium)")
+    parser.add_argument("--mix", metavar="LEVEL:SHARE,...", help="a blend, e.g. random:0.5,expert:0.5")
+    parser.add_argument("--steps", type=whole, help="transitions (default: the recipe's, 1,000,000)")
+    parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
+    parser.add_argument("--workers", type=whole, help="recording processes (default: one a core)")
+    parser.add_argument("--id", dest="dataset_id", help="the dataset's id (default: <env>-<level>-v0)")
+    parser.add_argument("--overwrite", action="store_true", help="replace a dataset of that id")
+    parser.add_argument("--retrain", action="store_true", help="use an agent trained here, not the shipped one")
+    _behaviour_dir(parser)
+
+    def run(**arguments: Any) -> None:
+        from offbench.record import collect
+
+        dataset_id = collect(**arguments)
+        print(f"{dataset_id} recorded; next: offbench train bdb --dataset {dataset_id}")
+
+    parser.set_defaults(run=run)
+
+
+def _behaviour(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("env", metavar="ENV", help="a shipped recipe or a recipe file")
+    parser.add_argument("--seed", type=natural, default=0, help="of the training (default: 0)")
+    parser.add_argument("--steps", type=whole, help="environment steps (default: the recipe's)")
+    parser.add_argument("--workers", type=whole, help="processes that measure rungs (default: one a core)")
+    parser.add_argument("--out", metavar="DIR", help="where the ladder goes (default: in the training's folder)")
+    _behaviour_dir(parser)
+
+    def run(**arguments: Any) -> None:
+        from offbench.agents import behaviour
+
+        ladder = behaviour(**arguments)
+        print(f"ladder in {ladder.folder}: random {ladder.random_return:.1f}, expert {ladder.expert_return:.1f}")
+        for rung in ladder.rungs:
+            print(
+                f"  step {rung.step:>9,}  return {rung.ret:>8.1f}  fraction {ladder.fraction(rung):.2f}  {rung.role}"
+            )
+
+    parser.set_defaults(run=run)
+
+
+def _behaviour_dir(parser: Parser) -> None:
+    parser.add_argument("--behaviour-dir", default="behaviour", metavar="DIR", help="trainings (default: behaviour)")
+
+
+def _train(parser: Parser, words: list[str]) -> None:
+    from offbench.algorithm import algorithm_names, load_algorithm
+    from offbench.settings import fields
+
+    parser.add_argument("algorithm", metavar="ALGO", help=f"one of {', '.join(algorithm_names())}")
+    parser.add_argument(
+        "--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets of one environment"
+    )
+    parser.add_argument("--seeds", type=seed_list, default=[0], metavar="LIST", help="3, 0,1,2 or 0:5 (default: 0)")
+    parser.add_argument("--steps", type=whole, default=1_000_000, help="updates (default: 1,000,000)")
+    parser.add_argument("--eval-every", type=whole, default=5_000, help="updates between evaluations (default: 5,000)")
+    parser.add_argument("--eval-episodes", type=whole, default=10, help="episodes of an evaluation (default: 10)")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
+    parser.add_argument("--workers", type=whole, help="evaluation processes (default: all cores but one)")
+    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+    algorithm = next((word for word in words if not word.startswith("-")), None)
+    if algorithm is None:
+        parser.epilog = "`offbench train ALGO --help` shows the algorithm's own settings."
+        return
+    group = parser.add_argument_group(f"settings of {algorithm}")
+    known = fields(load_algorithm(algorithm).Config)
+    for name, field in known.items():
+        several = bool(field.metadata.get("per_run"))
+        group.add_argument(
+            f"--{name.replace('_', '-')}",
+            dest=f"setting_{name}",
+            nargs="+" if several else None,
+            metavar="X",
+            default=argparse.SUPPRESS,
+            help=f"{field.metadata.get('help', '')} (default: {_default(field.default)})".replace("%", "%%"),
+        )
+
+    def run(**arguments: Any) -> None:
+        from offbench.launch import train
+
+        settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
+        rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
+        folders = train(**rest, **settings, command=shlex.join(["offbench", "train", *words]))
+        for folder in folders:
+            print(folder)
+        print(f"next: offbench normalize --runs {rest['runs']}")
+
+    parser.set_defaults(run=run)
+
+
+def _default(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def _evaluate(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run directory or a policy file")
+    parser.add_argument("--env", help="a recipe, instead of the environment the policy names")
+    parser.add_argument("--episodes", type=whole, default=10, help="default: 10")
+    parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
+    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mode")
+    parser.add_argument("--workers", type=whole, help="processes (default: one a core)")
+
+    def run(**arguments: Any) -> None:
+        from offbench.assess import evaluate
+
+        print("\n".join(evaluate(**arguments).lines()))
+
+    parser.set_defaults(run=run)
+
+
+def _normalize(parser: Parser, _: list[str]) -> None:
+    from offbench.tables import FORMATS
+
+    parser.add_argument("returns", nargs="*", type=number, metavar="RETURN", help="returns to score, with --env")
+    parser.add_argument("--env", help="the environment of the returns: a recipe")
+    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+    parser.add_argument("--format", choices=FORMATS, default="table", dest="style", help="default: table")
+    parser.add_argument("--plot", metavar="PICTURE", help="also draw the learning curves (.png, .svg, .pdf)")
+
+    def run(style: str, plot: str | None, **arguments: Any) -> None:
+        from offbench.tables import normalize_runs_or_returns, render
+
+        print(render(normalize_runs_or_returns(**arguments), style))
+        if plot:
+            from offbench.plots import plot_curves
+
+            print(f"curves in {plot_curves(arguments['runs'], plot)}", file=sys.stderr)
+
+    parser.set_defaults(run=run)
+
+
+def _list(parser: Parser, _: list[str]) -> None:
+    def run() -> None:
+        from offbench.describe import inventory_lines
+
+        print("\n".join(inventory_lines()))
+
+    parser.set_defaults(run=run)
+
+
+def _show(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset")
+    parser.add_argument("--plot", metavar="PICTURE", help="also draw the histogram of returns (.png, .svg, .pdf)")
+
+    def run(dataset_id: str, plot: str | None) -> None:
+        from offbench.describe import show
+
+        summary = show(dataset_id)
+        print("\n".join(summary.lines()))
+        if plot:
+            print(f"histogram in {summary.plot(plot)}", file=sys.stderr)
+
+    parser.set_defaults(run=run)
+
+
+ADD: dict[str, Callable[[Parser, list[str]], None]] = {
+    "collect": _collect,
+    "train": _train,
+    "normalize": _normalize,
+    "evaluate": _evaluate,
+    "behaviour": _behaviour,
+    "list": _list,
+    "show": _show,
+}
+
+
+def whole(text: str) -> int:
+    """Return a whole number from 1 (1e6 and 1_000_000 are understood)."""
+    return _whole(text, 1)
+
+
+def natural(text: str) -> int:
+    """Return a whole number from 0."""
+    return _whole(text, 0)
+
+
+def _whole(text: str, least: int) -> int:
+    try:
+        value = float(text)
+        if value != int(value) or value < least:
+            raise ValueError
+    except (ValueError, OverflowError):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}") from None
+    return int(value)
+
+
+def number(text: str) -> float:
+    """Return a number."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
+def seed_list(text: str) -> list[int]:
+    """Return the seeds of `3`, `0,1,2` or `0:5` (the end is left out, as in Python)."""
+    first, colon, last = text.partition(":")
+    if colon:
+        found = list(range(natural(first), natural(last)))
+        if not found:
+            raise argparse.ArgumentTypeError(f"{text!r} holds no seed")
+        return found
+    return [natural(part) for part in text.split(",")]

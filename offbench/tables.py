@@ -1,0 +1,163 @@
+"""`normalize`: runs to a score table, returns to scores, and tables to text."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offbench.errors import OffbenchError
+from offbench.ladder import read_ladder
+from offbench.recipes import load_recipe
+from offbench.runs import Run, find_runs
+from offbench.scores import LAST, mean_std, normalize, run_return
+
+Row = dict[str, Any]
+FORMATS = ("table", "json", "csv", "markdown", "latex")
+
+
+def score_runs(runs: str | Path = "runs") -> list[Row]:
+    """Return one row for each (dataset, algorithm, variant) below a folder, seeds averaged.
+
+    A run's score is the mean of its last 10 evaluations; a row has the mean and the standard deviation over
+    seeds, normalised by the dataset's own reference (`score`) and by D4RL's constants (`d4rl_score`).
+
+    Raises:
+        OffbenchError: the folder holds no evaluated run, or a damaged one.
+    """
+    groups: dict[tuple[str, str, str], list[tuple[Run, dict[str, Any]]]] = {}
+    for run in find_runs(Path(runs)):
+        config = run.config()
+        if config.get("format") == "offbench-run-1" and run.evaluations_path.exists() and run.evaluations():
+            key = (config["dataset"], config["algorithm"], config["variant"])
+            groups.setdefault(key, []).append((run, config))
+    if not groups:
+        raise OffbenchError(f"no evaluated runs below {runs}; start one with `offbench train ALGO --dataset ID`")
+    return [_row(*key, group) for key, group in sorted(groups.items())]
+
+
+def _row(dataset: str, algorithm: str, variant: str, group: list[tuple[Run, dict[str, Any]]]) -> Row:
+    evaluations = [run.evaluations() for run, _ in group]
+    returns = [run_return(found) for found in evaluations]
+    reached = min(max(found) for found in evaluations)
+    row: Row = {
+        "dataset": dataset,
+        "algorithm": algorithm,
+        "variant": variant,
+        "seeds": len(group),
+        "steps": reached,
+        "of_steps": max(int(config["steps"]) for _, config in group),
+        "evaluations": min(min(len(found), LAST) for found in evaluations),
+        "return": float(np.mean(returns)),
+    }
+    for column, reference in (("score", "dataset"), ("d4rl_score", "d4rl")):
+        pairs = [config["references"][reference] for _, config in group]
+        scores = [normalize(r, *pair) for r, pair in zip(returns, pairs, strict=True) if pair]
+        mean, std = mean_std(scores) if len(scores) == len(returns) else (None, None)
+        row |= {column: mean, f"{column}_std": std}
+    return row
+
+
+def score_returns(env: str, returns: Sequence[float], behaviour_dir: str | Path = "behaviour") -> list[Row]:
+    """Return one row for each return: its score by our reference (if there is a ladder) and by D4RL's constants.
+
+    Raises:
+        OffbenchError: unknown environment, a return that is not finite, or no reference at all.
+    """
+    recipe = load_recipe(env)
+    if not np.isfinite(returns).all():
+        raise OffbenchError(f"returns must be finite numbers, not {list(returns)}")
+    folders = [recipe.folder / "behaviour"] if recipe.folder else []
+    folders.append(Path(behaviour_dir) / recipe.name / "seed-0" / "ladder")
+    ladder = next((found for folder in folders if (found := read_ladder(folder))), None)
+    ours = (ladder.random_return, ladder.expert_return) if ladder else None
+    d4rl = (recipe.d4rl_min, recipe.d4rl_max) if recipe.d4rl_min is not None else None
+    if not ours and not d4rl:
+        raise OffbenchError(f"{env} has no reference scores yet; measure them with `offbench behaviour {env}`")
+    return [
+        {
+            "environment": recipe.env_id,
+            "return": value,
+            "score": normalize(value, *ours) if ours else None,
+            "d4rl_score": normalize(value, *d4rl) if d4rl else None,  # type: ignore[arg-type]
+        }
+        for value in returns
+    ]
+
+
+def normalize_runs_or_returns(
+    runs: str | Path = "runs", *, env: str | None = None, returns: Sequence[float] = ()
+) -> list[Row]:
+    """Score all runs below a folder; or, with `env`, score `returns` of that environment.
+
+    Rows are dictionaries; `offbench.tables.render(rows, "markdown")` prints them.
+    """
+    if env is None:
+        if returns:
+            raise OffbenchError("returns need their environment: give --env, e.g. --env hopper 1234.5")
+        return score_runs(runs)
+    if not returns:
+        raise OffbenchError(f"give the returns to normalise, e.g. --env {env} 1234.5 987")
+    return score_returns(env, returns)
+
+
+TITLES = {
+    "of_steps": None,  # shown as 50,000/1,000,000 in the steps column
+    "score": "score (own ref.)",
+    "score_std": None,
+    "d4rl_score": "score (D4RL ref.)",
+    "d4rl_score_std": None,
+}
+
+
+def render(rows: Sequence[Row], style: str = "table") -> str:
+    """Return rows as text: an aligned table, JSON, CSV, Markdown or LaTeX."""
+    if style == "json":
+        return json.dumps(list(rows), indent=1)
+    if style == "csv":
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        return text.getvalue().rstrip("\n")
+    keys = [key for key in rows[0] if TITLES.get(key, key) is not None]
+    header = [TITLES.get(key, key) or key for key in keys]
+    cells = [[_cell(row, key, "$\\pm$" if style == "latex" else "±") for key in keys] for row in rows]
+    if style == "markdown":
+        lines = [header, ["---"] * len(header), *cells]
+        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    if style == "latex":
+        return _latex(header, cells)
+    widths = [max(len(line[i]) for line in [header, *cells]) for i in range(len(header))]
+    lines = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in [header, *cells]]
+    rule = ["-" * width for width in widths]
+    return "\n".join("  ".join(line).rstrip() for line in [lines[0], rule, *lines[1:]])
+
+
+def _cell(row: Mapping[str, Any], key: str, plus_minus: str) -> str:
+    value = row[key]
+    if value is None:
+        return "-"
+    if key == "steps" and value != row["of_steps"]:
+        return f"{value:,} of {row['of_steps']:,}"
+    if isinstance(value, float):
+        std = row.get(f"{key}_std")
+        # one seed has no spread: say so rather than print 0
+        spread = "" if f"{key}_std" not in row else f" {plus_minus} " + ("?" if std is None else f"{std:.1f}")
+        return f"{value:.1f}{spread}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def _latex(header: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
+    def line(parts: Sequence[str]) -> str:
+        return " & ".join(part.replace("_", "\\_") for part in parts) + " \\\\"
+
+    body = [line(header), "\\midrule", *map(line, cells)]
+    return "\n".join(
+        [f"\\begin{{tabular}}{{{'l' * len(header)}}}", "\\toprule", *body, "\\bottomrule", "\\end{tabular}"]
+    )
