@@ -1,4 +1,4 @@
-"""What an algorithm is, and how one is found by name.
+"""What an algorithm is.
 
     class Config            frozen dataclass of `setting`s: CLI flags, help, config.json
     class Algorithm(config, observation_dim, action_dim, run_seeds, device)
@@ -14,18 +14,14 @@ Every tensor has the run axis first; runs of a stack share shapes and every sett
 from __future__ import annotations
 
 import dataclasses
-import functools
-import importlib.metadata
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, cast
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from offbench.errors import OffbenchError, unknown
-
-GROUP = "offbench.algos"
+from offbench.errors import OffbenchError
 
 
 class Batch(NamedTuple):
@@ -89,27 +85,6 @@ class Algorithm(Protocol):
     def policy(self, run: int) -> tuple[str, list[tuple[Tensor, Tensor]]]:
         """Return the policy file's kind and layers of one run."""
         ...
-
-
-@functools.cache
-def _entry_points() -> dict[str, importlib.metadata.EntryPoint]:
-    return {point.name: point for point in importlib.metadata.entry_points(group=GROUP)}
-
-
-def algorithm_names() -> list[str]:
-    """Return the names of all installed algorithms, ours and third parties'."""
-    return sorted(_entry_points())
-
-
-def load_algorithm(name: str) -> type[Algorithm]:
-    """Return an algorithm's class by name. Raises OffbenchError if it is unknown or does not import."""
-    points = _entry_points()
-    if name not in points:
-        raise unknown("algorithm", name, points)
-    try:
-        return cast(type[Algorithm], points[name].load())
-    except (ImportError, AttributeError) as error:
-        raise OffbenchError(f"algorithm {name!r} ({points[name].value}) does not import: {error}") from error
 
 
 def stack_configs(configs: Sequence[Any], device: torch.device | str) -> Any:

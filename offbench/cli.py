@@ -117,7 +117,7 @@ def _behaviour_dir(parser: Parser) -> None:
 
 
 def _train(parser: Parser, words: list[str]) -> None:
-    from offbench.algorithm import algorithm_names, load_algorithm
+    from offbench.registry import algorithm_names, load_algorithm
     from offbench.settings import fields
 
     parser.add_argument("algorithm", metavar="ALGO", help=f"one of {', '.join(algorithm_names())}")

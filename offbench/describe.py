@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from offbench import dataset
-from offbench.algorithm import algorithm_names
 from offbench.errors import OffbenchError
 from offbench.ladder import read_ladder
 from offbench.levels import LEVELS
 from offbench.policy import Array
 from offbench.recipes import load_recipe, names
+from offbench.registry import algorithm_names
 from offbench.scores import normalize
 
 BINS = 12

@@ -149,7 +149,7 @@ class Surveyor:
         return max(late[:CANDIDATES], key=self.measure)
 
     def medium(self, target: float, most: float, expert: int) -> int:
-        """Return the first rung whose measured return lies between `target` and `most`, else the nearest to `target`."""
+        """Return the first rung measured between `target` and `most`, else the one nearest to `target`."""
         early = [step for step in sorted(self.screened) if step <= expert]
         for step in early:
             # measure only what its screening interval says might lie there

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 
 from offbench import transitions
-from offbench.algorithm import load_algorithm
 from offbench.errors import OffbenchError
 from offbench.provenance import hardware, versions, warn_other_physics
 from offbench.recipes import d4rl_constants
+from offbench.registry import load_algorithm
 from offbench.runs import Run, run_folder, settings_dict, variant
 from offbench.settings import check, fields
 from offbench.training import Member, Schedule, Trainer

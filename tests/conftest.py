@@ -1,0 +1,84 @@
+"""Shared set-up: every test has its own Minari folder and cache; one tiny behaviour agent serves them all."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+# A real training, as small as it can be: two seconds, and its expert beats chance.
+TINY_RECIPE = """
+name = "tiny"
+env_id = "InvertedPendulum-v5"
+dataset_steps = 600
+
+[sac]
+steps = 2400
+segment = 400
+learning_starts = 400
+gradient_steps = 0.5
+hidden = [16, 16]
+batch_size = 64
+learning_rate = 3e-3
+rung_episodes = 4
+
+[measure]
+rung_episodes = 8
+reference_episodes = 20
+rungs = 4
+"""
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """A recipe file and a behaviour folder in which its agent is trained already."""
+    from offbench.agents import behaviour
+
+    folder = tmp_path_factory.mktemp("tiny")
+    recipe = folder / "tiny.toml"
+    recipe.write_text(TINY_RECIPE)
+    behaviour(str(recipe), behaviour_dir=folder / "behaviour", workers=1)
+    return str(recipe), str(folder / "behaviour")
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Datasets, cache and runs of one test, away from the user's own."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("OFFBENCH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def medium(tiny: tuple[str, str]) -> str:
+    """The id of a small dataset of the tiny recipe."""
+    import offbench
+
+    recipe, behaviour_dir = tiny
+    return offbench.collect(recipe, "medium", behaviour_dir=behaviour_dir, workers=1)
+
+
+@pytest.fixture
+def offbench_cli(home: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run the command line in a process of its own."""
+
+    def run(*words: str, **kwargs: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "offbench", *words]
+        kwargs = {"capture_output": True, "text": True, "cwd": home, "env": dict(os.environ), "timeout": 300} | kwargs
+        return subprocess.run(command, check=False, **kwargs)  # type: ignore[call-overload,no-any-return]
+
+    return run
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator for test data."""
+    return np.random.default_rng(20260101)

@@ -1,0 +1,63 @@
+"""Imports run one way, and no more is imported than a command needs."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+def imported(path: Path) -> set[str]:
+    """Return every module that a file imports, at its top or in a function."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names.add(node.module or "")
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "offbench").glob("*.py")), ids=lambda p: p.name)
+def test_the_toolkit_knows_no_algorithm_by_import(path: Path) -> None:
+    assert not {name for name in imported(path) if name.startswith(("offbench.algos", "algos"))}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "algos").glob("*.py")), ids=lambda p: p.name)
+def test_no_algorithm_imports_another(path: Path) -> None:
+    assert not {name for name in imported(path) if name.startswith(("offbench.algos", "algos"))}
+
+
+def test_datasets_hold_no_code() -> None:
+    assert not list((ROOT / "datasets").rglob("*.py"))
+
+
+def test_no_module_is_longer_than_400_lines() -> None:
+    long = {p.name: n for p in ROOT.glob("*/*.py") if (n := len(p.read_text().splitlines())) > 400}
+    assert not long
+
+
+@pytest.mark.parametrize("words", [["list"], ["normalize", "--env", "hopper", "1000"], ["collect", "--help"]])
+def test_light_commands_do_not_load_pytorch(words: list[str], home: Path) -> None:
+    code = f"""
+import sys
+from offbench.cli import main
+try:
+    main({words!r})
+except SystemExit as done:
+    assert done.code in (0, None), done.code
+assert "torch" not in sys.modules, "torch was imported"
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=home)
+
+
+def test_rollout_workers_do_not_load_pytorch(home: Path) -> None:
+    code = "import sys, offbench.rollout; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=home)

@@ -1,0 +1,136 @@
+"""Recording: the same content for any number of workers, and after any cut."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import offbench
+from offbench import dataset, seeds
+from offbench.errors import OffbenchError
+from offbench.policy import uniform
+from offbench.recipes import env_spec
+from offbench.record import cut_at
+from offbench.rollout import LANES, Episode, Rollouts, Task, play, result
+from offbench.seeds import Purpose
+
+BOUNDS = np.full(3, -1, np.float32), np.full(3, 1, np.float32)
+
+
+def test_content_is_the_same_for_any_number_of_workers(tiny: tuple[str, str]) -> None:
+    recipe, behaviour_dir = tiny
+    hashes = []
+    for workers in (1, 2, 3):
+        name = offbench.collect(
+            recipe, "expert", steps=3000, behaviour_dir=behaviour_dir, workers=workers, dataset_id=f"w{workers}-v0"
+        )
+        hashes.append(dataset.provenance(dataset.read_metadata(name))["content_sha256"])
+    assert len(set(hashes)) == 1
+
+
+def test_another_seed_gives_other_content(tiny: tuple[str, str]) -> None:
+    recipe, behaviour_dir = tiny
+    hashes = {
+        dataset.provenance(
+            dataset.read_metadata(
+                offbench.collect(
+                    recipe, "expert", seed=seed, behaviour_dir=behaviour_dir, workers=1, dataset_id=f"s{seed}-v0"
+                )
+            )
+        )["content_sha256"]
+        for seed in (0, 1)
+    }
+    assert len(hashes) == 2
+
+
+def test_an_episode_equals_one_played_by_hand_with_gymnasium() -> None:
+    """Episode 11 of a task of 20, replayed alone in an environment of its own from its seeds."""
+    spec, policy = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5")
+    episodes = play(Task(spec, policy.to_bytes(), 5, (2,), tuple(range(20)), False, False))
+    episode = episodes[11]
+    assert isinstance(episode, Episode)
+    env = gym.make("Hopper-v5")
+    observation, _ = env.reset(seed=seeds.integer(5, Purpose.RESET, 2, 11))
+    rng = seeds.generator(5, Purpose.ACTION, 2, 11)
+    noise = rng.uniform(-1, 1, (len(episode), 3))
+    np.testing.assert_array_equal(observation, episode.observations[0])
+    for t, action in enumerate(noise.astype(np.float32)):
+        observation, reward, terminated, truncated, _ = env.step(action)
+        np.testing.assert_array_equal(action, episode.actions[t])
+        np.testing.assert_array_equal(observation, episode.observations[t + 1])
+        assert reward == episode.rewards[t]
+    assert (terminated, truncated) == (episode.terminated, episode.truncated)
+
+
+def test_more_episodes_than_lanes_keep_their_order() -> None:
+    spec, policy = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5")
+    indices = tuple(range(LANES * 2 + 3))
+    together = play(Task(spec, policy.to_bytes(), 0, (), indices, False, False))
+    for index in indices[::5]:
+        (alone,) = play(Task(spec, policy.to_bytes(), 0, (), (index,), False, False))
+        assert isinstance(alone, Episode)
+        np.testing.assert_array_equal(alone.observations, together[index].observations)  # type: ignore[union-attr]
+
+
+def test_the_last_episode_is_cut_and_truncated() -> None:
+    spec, policy = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5")
+    with Rollouts(spec) as rollouts:
+        whole = list(itertools.islice(rollouts.episodes(policy, 0), 8))
+        total = sum(map(len, whole[:3])) + 1
+        cut = list(cut_at(iter(whole), total))
+    assert sum(map(len, cut)) == total
+    assert len(cut) == 4
+    assert (cut[-1].terminated, cut[-1].truncated) == (False, True)
+    assert cut[-1].observations.shape == (2, 11)
+    assert all(episode.terminated for episode in cut[:-1])
+
+
+def test_a_killed_worker_is_a_clear_error() -> None:
+    with Rollouts(env_spec("InvertedPendulum-v5"), workers=1) as rollouts:
+        policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
+        task = Task(rollouts.spec, policy.to_bytes(), 0, (), tuple(range(4)), True, True)
+        result(rollouts.submit(task))
+        assert rollouts._pool is not None
+        (pid,) = rollouts._pool._processes
+        future = rollouts.submit(Task(rollouts.spec, policy.to_bytes(), 0, (), tuple(range(5000)), False, True))
+        os.kill(pid, signal.SIGKILL)
+        with pytest.raises(OffbenchError, match="worker process died"):
+            result(future)
+
+
+@pytest.mark.slow
+def test_workers_end_when_their_parent_is_killed(tiny: tuple[str, str], home: Path) -> None:
+    recipe, behaviour_dir = tiny
+    words = ["collect", recipe, "--level", "random", "--steps", "3000000", "--behaviour-dir", behaviour_dir]
+    parent = subprocess.Popen([sys.executable, "-m", "offbench", *words, "--workers", "2"])
+    children: list[int] = []
+    deadline = time.monotonic() + 60
+    while len(children) < 2 and time.monotonic() < deadline:
+        time.sleep(0.2)
+        children = _children(parent.pid)
+    parent.kill()
+    parent.wait()
+    assert len(children) >= 2
+    while any(_alive(pid) for pid in children) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not any(_alive(pid) for pid in children)
+    assert dataset.local_ids() == []
+
+
+def _children(pid: int) -> list[int]:
+    path = Path(f"/proc/{pid}/task/{pid}/children")
+    return [int(word) for word in path.read_text().split()] if path.exists() else []
+
+
+def _alive(pid: int) -> bool:
+    status = Path(f"/proc/{pid}/status")
+    return status.exists() and "State:\tZ" not in status.read_text()
