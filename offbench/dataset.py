@@ -69,9 +69,8 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
     """
     path = root() / dataset_id / "data" / "metadata.json"
     if dataset_id.startswith((".", "/")) or ".." in Path(dataset_id).parts or not path.exists():
-        known = local_ids()
-        hint = "" if known else "; record one with `offbench collect ENV --level LEVEL`"
-        raise OffbenchError(f"{unknown('dataset', dataset_id, known)}{hint}")
+        hint = "record one with `offbench collect ENV --level LEVEL`"
+        raise OffbenchError(f"{unknown('dataset', dataset_id, local_ids())}; {hint}")
     metadata = read_json(path)
     if not isinstance(metadata, dict):
         raise OffbenchError(f"{path} is damaged: not a table; record or download the dataset again")

@@ -68,7 +68,7 @@ class Recipe:
     env_kwargs: tuple[tuple[str, Any], ...] = ()
     sac: SACSettings = dataclasses.field(default_factory=SACSettings)
     measure: Measurement = dataclasses.field(default_factory=Measurement)
-    folder: Path | None = dataclasses.field(default=None, compare=False)
+    folder: Path | None = dataclasses.field(default=None, compare=False, metadata={"internal": True})
 
     def env_spec(self) -> str:
         """Return the environment as Gymnasium's EnvSpec JSON. Raises OffbenchError if it cannot be made."""

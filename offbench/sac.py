@@ -27,7 +27,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from offbench import seeds
+from offbench import checkpoints, seeds
 from offbench.checkpoints import keep_newest, load_newest, save_checkpoint
 from offbench.errors import OffbenchError
 from offbench.files import csv_bytes, disk_errors, read_json, write_bytes, write_json
@@ -77,7 +77,8 @@ def train(training: Training, steps: int) -> None:
     try:
         with FileLock(training.folder / ".lock", timeout=0):
             _claim(training)
-            _train(training, steps)
+            if max(checkpoints.steps(training.folder), default=0) < steps:
+                _train(training, steps)
     except Timeout:
         raise OffbenchError(f"{training.folder} is in use by another offbench process; wait for it") from None
 
@@ -92,7 +93,8 @@ def _claim(training: Training) -> None:
         known = {key: read_json(path).get(key) for key in identity}
         if known != json.loads(json.dumps(identity)):
             raise OffbenchError(
-                f"{training.folder} holds a training of another recipe or seed; delete it or give another --out"
+                f"{training.folder} holds a training of another recipe or seed; "
+                "delete it or give another --behaviour-dir"
             )
         return
     write_json(path, identity | {"recipe_sha256": training.recipe.sha256(), "versions": versions()} | hardware())

@@ -9,7 +9,7 @@ import dataclasses
 import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from offbench.errors import OffbenchError, unknown
@@ -46,8 +46,8 @@ def setting(
 
 
 def fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
-    """Return the fields of a settings class by name."""
-    return {f.name: f for f in dataclasses.fields(cls)}
+    """Return the fields of a settings class by name, those that a user may set."""
+    return {f.name: f for f in dataclasses.fields(cls) if not f.metadata.get("internal")}
 
 
 def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
@@ -124,46 +124,52 @@ def _convert(value: Any, hint: Any) -> Any:
 
 
 def _convert_one(value: Any, option: Any) -> Any:
-    if option is type(None):
-        if value is None or value == "none":
-            return None
-        raise TypeError
     if typing.get_origin(option) is tuple:
         item = typing.get_args(option)[0]
         parts = value.split(",") if isinstance(value, str) else value
         if not isinstance(parts, list | tuple):
             raise TypeError
         return tuple(_convert_one(part, item) for part in parts)
-    if option is bool:
-        if isinstance(value, bool):
-            return value
-        return {"true": True, "false": False}[value.lower()] if isinstance(value, str) else _wrong()
-    if isinstance(value, bool) or value is None:
-        raise TypeError
-    if option is int:
-        number = float(value)
-        if number != int(number):
-            raise ValueError
-        return int(value) if not isinstance(value, str) else int(number)
-    if option is float:
+    if option in _FROM_TEXT and isinstance(value, str):
+        return _FROM_TEXT[option](value)
+    if option is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if option is str and isinstance(value, str):
-        return value
-    if dataclasses.is_dataclass(option) and isinstance(value, option):  # type: ignore[arg-type]
-        return value
-    raise TypeError
+    if option is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if type(value) is not option and not (dataclasses.is_dataclass(option) and isinstance(value, option)):  # type: ignore[arg-type]
+        raise TypeError
+    return value
 
 
-def _wrong() -> bool:
-    raise TypeError
+def _whole(text: str) -> int:
+    number = float(text)  # so that 1e6 is understood
+    if not number.is_integer():
+        raise ValueError
+    return int(number)
+
+
+def _truth(text: str) -> bool:
+    if text.lower() not in ("true", "false"):
+        raise ValueError
+    return text.lower() == "true"
+
+
+def _none(text: str) -> None:
+    if text != "none":
+        raise ValueError
+
+
+_FROM_TEXT: dict[Any, Callable[[str], Any]] = {int: _whole, float: float, bool: _truth, str: str, type(None): _none}
+
+
+_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "none"}
 
 
 def _describe(hint: Any) -> str:
-    words = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "none"}
     parts = []
     for option in _options(hint):
         if typing.get_origin(option) is tuple:
-            parts.append(f"a list of {words.get(typing.get_args(option)[0], 'values')}s like 256,256")
+            parts.append("a list of whole numbers like 256,256" if int in typing.get_args(option) else "a list")
         else:
-            parts.append(words.get(option, getattr(option, "__name__", str(option))))
+            parts.append(_WORDS.get(option, str(option)))
     return " or ".join(parts)

@@ -1,0 +1,193 @@
+"""Bad input: exit code 2 and one line that names the problem and the remedy; never a traceback."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import offbench
+from offbench import dataset
+from offbench.cli import main
+from tests.test_transitions import episode, foreign
+
+CASES: dict[str, tuple[str, str]] = {
+    # what the user typed: what the line must hold
+    "colect hopper": ("unknown command 'colect': did you mean 'collect'?", ""),
+    "collect": ("the following arguments are required: ENV", "--help"),
+    "collect hoper": ("unknown environment 'hoper': did you mean 'hopper'?", ""),
+    "collect xyzzy": ("unknown environment 'xyzzy': known:", "hopper"),
+    "collect hopper --level medum": ("unknown level 'medum': did you mean 'medium'?", ""),
+    "collect hopper --level 1.5": ("a fraction for --level must lie above 0 and at most at 1", "1.5"),
+    "collect hopper --level nan": ("unknown level 'nan'", ""),
+    "collect hopper --steps ten": ("argument --steps: 'ten' is not a whole number from 1", ""),
+    "collect hopper --steps 0": ("argument --steps: '0' is not a whole number from 1", ""),
+    "collect hopper --steps 1.5": ("argument --steps: '1.5' is not a whole number", ""),
+    "collect hopper --steps inf": ("argument --steps: 'inf' is not a whole number", ""),
+    "collect hopper --seed -1": ("argument --seed: '-1' is not a whole number from 0", ""),
+    "collect hopper --workers 0": ("argument --workers: '0' is not a whole number from 1", ""),
+    "collect hopper --id bad id": ("unrecognized arguments: id", ""),
+    "collect hopper --id nodigits": ("'nodigits' is not a dataset id", "-v0"),
+    "collect hopper --id ../../etc-v0": ("is not a dataset id", ""),
+    "collect hopper --id /tmp/x-v0": ("is not a dataset id", ""),
+    "collect hopper --mix random": ("--mix takes LEVEL:SHARE", ""),
+    "collect hopper --mix random:0.5,expert:0.4": ("must add up to 1, not 0.9", ""),
+    "collect hopper --mix randm:0.5,expert:0.5": ("unknown level 'randm': did you mean 'random'?", ""),
+    "collect hopper --mix medium-expert:0.5,random:0.5": ("--mix takes single levels", ""),
+    "collect ./none.toml": ("no recipe file none.toml", ""),
+    "collect hopper --flag": ("unrecognized arguments: --flag", ""),
+    "train": ("the following arguments are required: ALGO, --dataset", "--help"),
+    "train bcd --dataset x-v0": ("unknown algorithm 'bcd': did you mean", ""),
+    "train bdb": ("the following arguments are required: --dataset", ""),
+    "train bdb --dataset x-v0": ("unknown dataset 'x-v0'", "offbench collect"),
+    "train bdb --dataset ../x-v0": ("unknown dataset '../x-v0'", ""),
+    "train bdb --dataset MEDIUM --beta 2": ("bdb: beta must be at most 1, not 2", ""),
+    "train bdb --dataset MEDIUM --beta adaptve": ("beta must be one of adaptive, not 'adaptve'", ""),
+    "train bdb --dataset MEDIUM --alpha nan": ("alpha must be a finite number", ""),
+    "train bdb --dataset MEDIUM --alpha -1": ("alpha must be at least 0", ""),
+    "train bdb --dataset MEDIUM --critics 1": ("critics must be at least 2", ""),
+    "train bdb --dataset MEDIUM --critics two": ("critics must be a whole number, not 'two'", ""),
+    "train bdb --dataset MEDIUM --hidden 256x256": ("hidden must be a list of whole numbers like 256,256", ""),
+    "train bdb --dataset MEDIUM --normalize perhaps": ("normalize must be true or false, not 'perhaps'", ""),
+    "train bdb --dataset MEDIUM --beta-scope world": ("beta_scope must be one of sample, batch", ""),
+    "train bdb --dataset MEDIUM --seeds 3:3": ("'3:3' holds no seed", ""),
+    "train bdb --dataset MEDIUM --seeds a": ("'a' is not a whole number from 0", ""),
+    "train bdb --dataset MEDIUM --seeds 1,1": ("seeds must be different whole numbers", ""),
+    "train bdb --dataset MEDIUM --steps 0": ("'0' is not a whole number from 1", ""),
+    "train bdb --dataset MEDIUM --eval-every x": ("'x' is not a whole number from 1", ""),
+    "train bdb --dataset MEDIUM --device cuda": ("no device cuda: PyTorch", "--device cpu"),
+    "train bdb --dataset MEDIUM --device tpu": ("device must be auto, cpu, cuda or cuda:N, not 'tpu'", ""),
+    "train td3_bc --dataset MEDIUM --beta 0.5": ("unrecognized arguments: --beta 0.5", ""),
+    "train bdb --dataset DISCRETE": ("actions must be a Box space, not Discrete(2)", ""),
+    "train bdb --dataset NAN": ("rewards hold NaN or infinite numbers", ""),
+    "train bdb --dataset MEDIUM DISCRETE": ("actions must be a Box space", ""),
+    "evaluate nowhere": ("no policy file nowhere", ""),
+    "evaluate .": ("no file config.json", ""),
+    "evaluate empty.safetensors": ("not a readable policy file", ""),
+    "normalize --runs nowhere": ("no evaluated runs below nowhere", "offbench train"),
+    "normalize 100": ("returns need their environment: give --env", ""),
+    "normalize --env hopper": ("give the returns to normalise", ""),
+    "normalize --env hoper 100": ("did you mean 'hopper'?", ""),
+    "normalize --env hopper abc": ("'abc' is not a number", ""),
+    "normalize --env hopper nan": ("returns must be finite numbers", ""),
+    "normalize --format html": ("invalid choice: 'html'", ""),
+    "show x-v0": ("unknown dataset 'x-v0'", ""),
+    "show MEDIM": ("did you mean 'tiny-medium-v0'?", ""),
+    "show MEDIUM --plot out.gif": ("a picture's name must end in .png, .svg, .pdf, not 'out.gif'", ""),
+    "behaviour hoper": ("did you mean 'hopper'?", ""),
+    "behaviour hopper --steps 12345": ("steps must be a multiple of 10000", ""),
+}
+
+
+@pytest.fixture
+def prepared(medium: str, home: Path) -> dict[str, str]:
+    discrete = {"actions": np.zeros(3, np.int64)}
+    foreign("discrete-v0", [episode(3, 0, True, **discrete)], actions=gym.spaces.Discrete(2))
+    foreign("nan-v0", [episode(3, 0, True, rewards=np.array([0.0, np.nan, 1.0]))])
+    (home / "empty.safetensors").touch()
+    return {"MEDIUM": medium, "DISCRETE": "discrete-v0", "NAN": "nan-v0", "MEDIM": "tiny-medum-v0"}
+
+
+def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """Run the command line in this process; return its one line."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    out, err = capsys.readouterr()
+    assert stopped.value.code == 2
+    lines = [line for line in err.splitlines() if not line.startswith("converting ")]
+    assert len(lines) == 1, err
+    assert lines[0].startswith("offbench: ")
+    assert "Traceback" not in out + err
+    return lines[0]
+
+
+@pytest.mark.parametrize("typed", CASES)
+def test_bad_words(typed: str, prepared: dict[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    line = refusal([prepared.get(word, word) for word in typed.split()], capsys)
+    for part in CASES[typed]:
+        assert part in line
+
+
+RECIPES: dict[str, tuple[str, str]] = {
+    "unknown key": ('env_id = "Hopper-v5"\nversoin = 3', "unknown key 'versoin': did you mean 'version'?"),
+    "unknown sac key": ('env_id = "Hopper-v5"\n[sac]\nlerning_rate = 1', "did you mean 'learning_rate'?"),
+    "wrong type": ('env_id = "Hopper-v5"\n[sac]\nsteps = "many"', "steps must be a whole number, not 'many'"),
+    "wrong range": ('env_id = "Hopper-v5"\n[sac]\ndiscount = 1.5', "discount must be at most 1"),
+    "no env": ("dataset_steps = 5", "missing key 'env_id'"),
+    "not TOML": ("env_id = ", "not a readable TOML file"),
+    "table": ('env_id = "Hopper-v5"\nsac = 3', "sac must be a table"),
+    "name": ('env_id = "Hopper-v5"\nname = "../x"', "name may hold letters"),
+    "half a reference": ('env_id = "Hopper-v5"\nd4rl_min = 1.0', "both d4rl_min and d4rl_max"),
+    "segment": ('env_id = "Hopper-v5"\n[sac]\nsegment = 30\nenvs = 4', "segment must be a multiple of 4"),
+    "unknown env": ('env_id = "Hoper-v5"', "cannot make the environment 'Hoper-v5'"),
+    "discrete env": ('env_id = "CartPole-v1"', "actions must be a Box space, not Discrete(2)"),
+    "env argument": ('env_id = "Hopper-v5"\n[env_kwargs]\nlegs = 3', "cannot make the environment"),
+}
+
+
+@pytest.mark.parametrize("kind", RECIPES)
+def test_bad_recipes(kind: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, message = RECIPES[kind]
+    (home / "my.toml").write_text(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        line = refusal(["behaviour", "./my.toml"], capsys)
+    assert message in line
+    assert not list(home.glob("behaviour/**/*.safetensors"))
+
+
+def test_an_existing_id(tiny: tuple[str, str], medium: str, capsys: pytest.CaptureFixture[str]) -> None:
+    recipe, behaviour_dir = tiny
+    line = refusal(["collect", recipe, "--behaviour-dir", behaviour_dir], capsys)
+    assert "tiny-medium-v0 exists already; use --overwrite" in line
+
+
+def test_more_replay_than_there_is(tiny: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    recipe, behaviour_dir = tiny
+    words = ["collect", recipe, "--behaviour-dir", behaviour_dir, "--level", "medium-replay", "--steps", "1000000"]
+    assert "use fewer --steps" in refusal(words, capsys)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
+def test_a_read_only_folder(tiny: tuple[str, str], home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recipe, behaviour_dir = tiny
+    dataset.root().mkdir()
+    dataset.root().chmod(0o500)
+    assert "cannot write" in refusal(["collect", recipe, "--behaviour-dir", behaviour_dir], capsys)
+
+
+def test_a_file_where_a_folder_should_be(
+    tiny: tuple[str, str], medium: str, home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (home / "taken").write_text("")
+    line = refusal(["train", "bdb", "--dataset", medium, "--runs", "taken", "--steps", "10"], capsys)
+    assert "cannot write" in line
+
+
+def test_a_full_disk_is_seen_before_recording(
+    tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(dataset.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10_000})())
+    recipe, behaviour_dir = tiny
+    line = refusal(["collect", recipe, "--behaviour-dir", behaviour_dir], capsys)
+    assert "not enough room" in line
+    assert "MINARI_DATASETS_PATH" in line
+    assert dataset.local_ids() == []
+
+
+def test_datasets_of_different_shapes_do_not_stack(medium: str) -> None:
+    foreign("other-v0", [episode(3, 0, True)])
+    with pytest.raises(offbench.OffbenchError, match="one stack must have the same shapes"):
+        offbench.train("td3_bc", [medium, "other-v0"], steps=10, hidden=(8,))
+
+
+def test_a_policy_for_another_environment(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
+    settings: dict[str, Any] = {"hidden": (8,), "batch_size": 8, "eval_every": 10, "eval_episodes": 1}
+    (folder,) = offbench.train("td3_bc", medium, steps=10, **settings)
+    assert "takes observations (4,)" in refusal(["evaluate", str(folder), "--env", "hopper"], capsys)

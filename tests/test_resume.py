@@ -1,0 +1,202 @@
+"""Killed and resumed: the same bits as undisturbed, nothing lost, nothing twice."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import offbench
+from offbench import checkpoints
+from offbench.agents import folder_of
+from offbench.errors import OffbenchError
+from offbench.recipes import load_recipe
+from offbench.runs import Run
+
+SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 100, "eval_episodes": 2}
+EXTRA: dict[str, dict[str, Any]] = {"td3_bc": {}, "bdb": {}, "cql": {"num_actions": 2, "bc_steps": 150}}
+
+
+def train(algorithm: str, dataset: str, runs: str, steps: int, **more: Any) -> list[Run]:
+    settings = SMALL | EXTRA[algorithm] | more
+    return [Run(path) for path in offbench.train(algorithm, dataset, steps=steps, runs=runs, **settings)]
+
+
+@pytest.mark.parametrize("algorithm", ["td3_bc", "bdb", "cql"])
+def test_a_run_stopped_and_resumed_ends_with_the_same_bits(medium: str, algorithm: str) -> None:
+    (whole,) = train(algorithm, medium, "whole", 300)
+    for steps in (100, 200, 300):
+        (pieces,) = train(algorithm, medium, "pieces", steps)
+    assert whole.policy_path.read_bytes() == pieces.policy_path.read_bytes()
+    assert whole.evaluations_path.read_bytes() == pieces.evaluations_path.read_bytes()
+    ours, theirs = (load_file(run.folder / "checkpoint-000000300.safetensors") for run in (whole, pieces))
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_seeds_in_a_stack_stop_and_resume_too(medium: str) -> None:
+    whole = train("bdb", medium, "whole", 200, seeds=[0, 1, 2])
+    train("bdb", medium, "pieces", 100, seeds=[0, 1, 2])
+    pieces = train("bdb", medium, "pieces", 200, seeds=[0, 1, 2])
+    for a, b in zip(whole, pieces, strict=True):
+        assert a.policy_path.read_bytes() == b.policy_path.read_bytes()
+
+
+def test_a_run_alone_equals_the_same_run_in_a_stack(medium: str) -> None:
+    """From the data to the weights: batches, noise and initial weights depend on the run's own seed alone."""
+    stack = train("bdb", medium, "stack", 200, seeds=[3, 4, 5])
+    for run in stack:
+        (alone,) = train("bdb", medium, "alone", 200, seeds=run.config()["seed"])
+        ours, theirs = (load_file(r.folder / "checkpoint-000000200.safetensors") for r in (run, alone))
+        for name in ours:
+            torch.testing.assert_close(ours[name], theirs[name], atol=1e-4, rtol=0)
+
+
+def test_a_finished_run_is_left_alone(medium: str) -> None:
+    (run,) = train("td3_bc", medium, "runs", 100)
+    before = {path.name: path.stat().st_mtime_ns for path in run.folder.glob("*.safetensors")}
+    train("td3_bc", medium, "runs", 100)
+    assert {path.name: path.stat().st_mtime_ns for path in run.folder.glob("*.safetensors")} == before
+
+
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (whole,) = train("td3_bc", medium, "whole", 300)
+    (run,) = train("td3_bc", medium, "runs", 200)
+    newest = run.folder / "checkpoint-000000200.safetensors"
+    newest.write_bytes(newest.read_bytes()[:1000])
+    train("td3_bc", medium, "runs", 300)
+    assert "is damaged" in capsys.readouterr().err
+    assert run.policy_path.read_bytes() == whole.policy_path.read_bytes()
+    assert run.evaluations_path.read_bytes() == whole.evaluations_path.read_bytes()
+
+
+def test_another_run_in_the_same_place_is_refused(tiny: tuple[str, str], medium: str) -> None:
+    train("td3_bc", medium, "runs", 100)
+    with pytest.raises(OffbenchError, match="eval_episodes 2, not 3"):
+        train("td3_bc", medium, "runs", 200, eval_episodes=3)
+    recipe, behaviour_dir = tiny
+    offbench.collect(recipe, "medium", behaviour_dir=behaviour_dir, workers=1, seed=1, overwrite=True)
+    with pytest.raises(OffbenchError, match="dataset_sha256"):
+        train("td3_bc", medium, "runs", 200)
+
+
+def test_divergence_is_said_and_the_last_checkpoint_kept(medium: str) -> None:
+    train("td3_bc", medium, "runs", 100)
+    (run,) = (Run(path.parent) for path in Path("runs").rglob("config.json"))
+    newest = run.folder / "checkpoint-000000100.safetensors"
+    tensors = load_file(newest)
+    tensors["critic.flat"] *= 1e30  # as a run that is about to overflow
+    save_file(tensors, newest, metadata={"offbench": '{"step": 100}'})
+    with pytest.raises(OffbenchError, match=r"became NaN or infinite by step 200.*last checkpoint is kept"):
+        train("td3_bc", medium, "runs", 300)
+    assert checkpoints.steps(run.folder) == [100]
+
+
+def kill_when(process: subprocess.Popen[bytes], ready: Any, delay: float) -> None:
+    """Send SIGKILL a while after `ready()` first holds."""
+    deadline = time.monotonic() + 120
+    while not ready() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(delay)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+@pytest.mark.slow
+def test_training_survives_kill_9(medium: str, home: Path) -> None:
+    words = ["train", "bdb", "--dataset", medium, "--steps", "1500", "--eval-every", "100", "--eval-episodes", "2"]
+    words += ["--hidden", "16,16", "--batch-size", "32", "--seeds", "0:2"]
+    command = [sys.executable, "-m", "offbench", *words]
+    subprocess.run([*command, "--runs", "whole"], check=True, capture_output=True)
+    folder = home / "killed" / medium / "bdb" / "batch_size=32,hidden=16x16"
+    kills = 0
+    for delay in (0.0, 0.05, 0.13, 0.21):
+        seen = set(checkpoints.steps(folder / "seed-0"))
+        process = subprocess.Popen(
+            [*command, "--runs", "killed"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        kill_when(process, lambda seen=seen: set(checkpoints.steps(folder / "seed-0")) - seen, delay)
+        kills += process.returncode == -signal.SIGKILL
+    assert kills >= 2
+    subprocess.run([*command, "--runs", "killed"], check=True, capture_output=True)
+    for seed in (0, 1):
+        whole, killed = (
+            Run(home / r / folder.relative_to(home / "killed") / f"seed-{seed}") for r in ("whole", "killed")
+        )
+        assert whole.policy_path.read_bytes() == killed.policy_path.read_bytes()
+        assert whole.evaluations_path.read_bytes() == killed.evaluations_path.read_bytes()
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_a_run_that_resumes(medium: str, home: Path) -> None:
+    words = [
+        "train",
+        "td3_bc",
+        "--dataset",
+        medium,
+        "--steps",
+        "100000",
+        "--eval-every",
+        "100",
+        "--eval-episodes",
+        "2",
+    ]
+    command = [sys.executable, "-m", "offbench", *words, "--hidden", "16,16", "--batch-size", "32"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    folder = home / "runs" / medium / "td3_bc" / "batch_size=32,hidden=16x16" / "seed-0"
+    deadline = time.monotonic() + 60
+    while not checkpoints.steps(folder) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "the same command goes on" in errors
+    assert "Traceback" not in errors
+    assert checkpoints.steps(folder)
+
+
+@pytest.mark.slow
+def test_behaviour_training_survives_kill_9(tiny: tuple[str, str], home: Path) -> None:
+    """The rungs, the transitions and the ladder equal those of an undisturbed training."""
+    recipe, behaviour_dir = tiny
+    whole = folder_of(load_recipe(recipe), 0, Path(behaviour_dir))
+    killed = folder_of(load_recipe(recipe), 0, home / "killed")
+    command = [sys.executable, "-m", "offbench", "behaviour", recipe, "--behaviour-dir", str(home / "killed")]
+    kills = 0
+    for delay in (0.0, 0.2, 0.4):
+        seen = set(checkpoints.steps(killed))
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        kill_when(process, lambda seen=seen: set(checkpoints.steps(killed)) - seen, delay)
+        kills += process.returncode == -signal.SIGKILL
+    assert kills >= 2
+    subprocess.run(command, check=True, capture_output=True)
+    for path in sorted((whole / "policies").iterdir()):
+        assert path.read_bytes() == (killed / "policies" / path.name).read_bytes()
+    assert (whole / "ladder" / "medium-replay.npz").exists()
+    ours, theirs = ((folder / "ladder" / "ladder.csv").read_text().splitlines() for folder in (whole, killed))
+    no_hours = [[cell for i, cell in enumerate(line.split(",")) if i != 1] for line in ours]
+    assert no_hours == [[cell for i, cell in enumerate(line.split(",")) if i != 1] for line in theirs]
+
+
+def test_two_processes_cannot_train_the_same_run(medium: str) -> None:
+    from offbench.training import held
+
+    (run,) = train("td3_bc", medium, "runs", 100)
+    code = f"""
+import sys
+from offbench.cli import main
+main(["train", "td3_bc", "--dataset", {medium!r}, "--steps", "200", "--eval-every", "100", "--eval-episodes", "2",
+      "--hidden", "16,16", "--batch-size", "32"])
+"""
+    with held(run):
+        found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=dict(os.environ))
+    assert found.returncode == 2
+    assert "being trained by another process" in found.stderr
