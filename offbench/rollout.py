@@ -10,6 +10,7 @@ neither the number of workers nor the task it fell into can change it. Workers n
 from __future__ import annotations
 
 import collections
+import contextlib
 import functools
 import multiprocessing
 import os
@@ -202,7 +203,8 @@ class Rollouts:
     def submit(self, task: Task) -> Future[Any]:
         """Start a task; its result is the list that `play` returns."""
         if self._pool:
-            return self._pool.submit(play, task)
+            with _no_ctrl_c():  # submitting may start a worker; half a start would leave the pool unusable
+                return self._pool.submit(play, task)
         future: Future[Any] = Future()
         future.set_result(play(task))
         return future
@@ -274,6 +276,19 @@ def _gather(futures: Sequence[Future[Any]]) -> Future[list[Outcome]]:
     for future in futures:
         future.add_done_callback(arrived)
     return whole
+
+
+@contextlib.contextmanager
+def _no_ctrl_c() -> Iterator[None]:
+    """Hold Ctrl-C back for a moment; processes started meanwhile never see it at all."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _start_worker(parent: int) -> None:
