@@ -11,6 +11,9 @@ D moves just before the actor, its actions pi(s) detached; it works on logits, -
 beta = 0 every number is TD3+BC's, bit for bit. Critics start in agreement, so Unc < 1 and the adaptive beta is
 near 1 at first: the published rule lets the discriminator alone hold the policy until Q has grown.
 Deviations: none known; the paper leaves open whether beta is a sample's or a batch's (`beta_scope`).
+
+Ours, not the paper's, and off by default (the paper's future work, and remedies for that early beta):
+`uncertainty = relative`, `beta_max`, `cloning_steps`, `beta = learned`, `critic_penalty = cql`; the end of this file.
 """
 
 from __future__ import annotations
@@ -23,9 +26,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from offbench.algorithm import Batch, Draw
-from offbench.networks import Network, Target
+from offbench.algorithm import Batch, Draw, PolicyParts
+from offbench.networks import Learned, Network, Target
 from offbench.settings import setting
+
+ADAPTIVE, LEARNED = -1.0, -2.0  # what stack_configs makes of beta's words
 
 
 @dataclass(frozen=True)
@@ -35,16 +40,25 @@ class Config:
     alpha: float = setting(2.5, "weight of Q against the constraint: lambda = alpha / mean|Q1|", low=0, per_run=True)
     beta: float | str = setting(
         "adaptive",
-        "share of the discriminator in the constraint, or adaptive",
+        "share of the discriminator in the constraint; adaptive (the paper's rule), or learned (ours)",
         low=0,
         high=1,
-        choices=("adaptive",),
+        choices=("adaptive", "learned"),
         per_run=True,
     )
     beta_scope: str = setting("sample", "one adaptive beta a sample or a batch", choices=("sample", "batch"))
     critics: int = setting(2, "M, critics behind the target's minimum and the uncertainty", low=2)
     discriminator_learning_rate: float = setting(3e-4, "Adam's learning rate of the discriminator", above=0)
     discriminator_hidden: tuple[int, ...] = setting((64, 64), "hidden layers of the discriminator (tanh)", low=1)
+    uncertainty: str = setting("absolute", "ours: relative divides Unc by mean|Q1|", choices=("absolute", "relative"))
+    uncertainty_scale: float = setting(1.0, "ours: factor of the relative Unc", above=0)
+    beta_max: float = setting(1.0, "ours: adaptive and learned beta stay below this", low=0, high=1, per_run=True)
+    cloning_steps: int = setting(0, "ours: updates at the start whose constraint is cloning alone", low=0)
+    beta_target: float = setting(0.05, "ours: cloning error that a learned beta holds", above=0, per_run=True)
+    beta_learning_rate: float = setting(3e-4, "ours: Adam's learning rate of a learned beta", above=0)
+    critic_penalty: str = setting("none", "ours: cql adds its conservative penalty", choices=("none", "cql"))
+    penalty_weight: float = setting(1.0, "ours: weight of that penalty", low=0, per_run=True)
+    penalty_actions: int = setting(10, "ours: uniform actions in its log-sum-exp", low=1)
     discount: float = setting(0.99, "discount", low=0, high=1)
     tau: float = setting(0.005, "Polyak rate of the targets", above=0, high=1)
     policy_noise: float = setting(0.2, "std of the noise on target actions, in units of the largest action", low=0)
@@ -82,16 +96,8 @@ def discriminator_loss(discriminator: Network, actor: Network, batch: Batch) -> 
     return loss, {"discriminator_loss": loss.detach()} | seen
 
 
-def uncertainty(critic: Network, batch: Batch, pi: Tensor, c: Any) -> Tensor:
-    """Return max_i Q_i - min_i Q_i over the M critics at (s, pi(s)), [runs, batch] (Algorithm 2)."""
-    with torch.no_grad():
-        q = critic(batch.observations, pi).squeeze(-1)
-        unc = q.amax(0) - q.amin(0)
-    return unc.mean(-1, keepdim=True).expand_as(unc) if c.beta_scope == "batch" else unc
-
-
 def actor_loss(
-    actor: Network, critic: Network, discriminator: Network, batch: Batch, c: Any
+    actor: Network, critic: Network, discriminator: Network, learned_beta: Learned, batch: Batch, c: Any, warm_up: bool
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the actor's loss [runs], eq. 17, and what is logged."""
     pi = actor(batch.observations)[0].tanh()
@@ -100,13 +106,30 @@ def actor_loss(
     cloning = (pi - batch.actions).square().mean(-1)
     adversarial = softplus(-discriminator.frozen(batch.observations, pi)[0].squeeze(-1))
     unc = uncertainty(critic, batch, pi.detach(), c)
-    adaptive = (1 / unc).clamp(max=1)  # Unc = 0 gives 1
-    beta = torch.where(c.beta.isnan().unsqueeze(-1), adaptive, c.beta.unsqueeze(-1))  # [runs, batch]
+    beta = mixture(unc, learned_beta, c, warm_up)
     loss = -lambda_q + (beta * adversarial + (1 - beta) * cloning).mean(-1)
     logs = {"actor_loss": loss.detach(), "lambda_q": lambda_q.detach(), "bc": cloning.detach().mean(-1)}
     low, median, high = beta.quantile(beta.new_tensor([0.05, 0.5, 0.95]), dim=-1)
     logs |= {"adversarial": adversarial.detach().mean(-1), "uncertainty": unc.mean(-1), "beta": beta.mean(-1)}
     return loss, logs | {"beta_5": low, "beta_50": median, "beta_95": high}
+
+
+def uncertainty(critic: Network, batch: Batch, pi: Tensor, c: Any) -> Tensor:
+    """Return max_i Q_i - min_i Q_i over the M critics at (s, pi(s)), [runs, batch] (Algorithm 2)."""
+    q = critic.frozen(batch.observations, pi).squeeze(-1)
+    unc = q.amax(0) - q.amin(0)
+    if c.uncertainty == "relative":
+        unc = c.uncertainty_scale * unc / q[0].abs().mean(-1, keepdim=True)
+    return unc.mean(-1, keepdim=True).expand_as(unc) if c.beta_scope == "batch" else unc
+
+
+def mixture(unc: Tensor, learned_beta: Learned, c: Any, warm_up: bool) -> Tensor:
+    """Return beta [runs, batch]: fixed, adaptive by Algorithm 2, or learned."""
+    fixed, most = c.beta.unsqueeze(-1), c.beta_max.unsqueeze(-1)
+    adaptive = (1 / unc).clamp(max=1).minimum(most)  # Unc = 0 gives 1
+    learned = learned_beta.flat.detach()[0].sigmoid().minimum(most)
+    beta = torch.where(fixed == ADAPTIVE, adaptive, torch.where(fixed == LEARNED, learned, fixed))
+    return torch.zeros_like(beta) if warm_up else beta
 
 
 class BDB:
@@ -148,40 +171,83 @@ class BDB:
             activation="tanh",
             device=device,
         )
+        # one number a run, beta = its sigmoid; it starts at 0.5 and stands still unless beta is learned
+        self.learned_beta = Learned(torch.zeros(1, len(run_seeds), 1, device=device), c.beta_learning_rate)
+        self.learns_beta = bool((c.beta == LEARNED).any())
         self.actor_target, self.critic_target = Target(self.actor), Target(self.critic)
         self.learned = {
             "actor": self.actor,
             "critic": self.critic,
             "discriminator": self.discriminator,
+            "learned_beta": self.learned_beta,
             "actor_target": self.actor_target,
             "critic_target": self.critic_target,
         }
 
     @property
     def draws(self) -> dict[str, Draw]:
-        """One normal number for each target action."""
-        return {"target": Draw((self.config.batch_size, self.action_dim), "normal")}
+        """One normal number for each target action; uniform actions if the critics are penalised."""
+        c, shape = self.config, (self.config.batch_size, self.action_dim)
+        penalty = {"uniform": Draw((c.penalty_actions, *shape), "uniform")} if c.critic_penalty == "cql" else {}
+        return {"target": Draw(shape, "normal"), **penalty}
 
     def kind(self, step: int) -> str:
         """The actor and the targets wait for every `policy_freq`-th update."""
-        return "critic+actor" if (step + 1) % self.config.policy_freq == 0 else "critic"
+        if (step + 1) % self.config.policy_freq:
+            return "critic"
+        return "critic+cloning actor" if step < self.config.cloning_steps else "critic+actor"
 
     def update(self, batch: Batch, noise: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
         """One update of every run."""
         c = self.config
         loss, logs = critic_loss(self.critic, self.critic_target, self.actor_target, batch, noise["target"], c)
+        if c.critic_penalty == "cql":
+            penalty = conservative_penalty(self.critic, self.actor, batch, noise["uniform"])
+            loss, logs["penalty"] = loss + c.penalty_weight * penalty, penalty.detach()
         self.critic.minimize(loss.sum())
-        if kind == "critic+actor":
+        if kind != "critic":
             loss, more = discriminator_loss(self.discriminator, self.actor, batch)
             self.discriminator.minimize(loss.sum())
             logs |= more
-            loss, more = actor_loss(self.actor, self.critic, self.discriminator, batch, c)
+            warm_up = kind == "critic+cloning actor"
+            loss, more = actor_loss(self.actor, self.critic, self.discriminator, self.learned_beta, batch, c, warm_up)
             self.actor.minimize(loss.sum())
+            if self.learns_beta and not warm_up:
+                self.learned_beta.minimize(learned_beta_loss(self.learned_beta, more["bc"], c).sum())
             self.actor_target.follow(c.tau)
             self.critic_target.follow(c.tau)
             logs |= more
         return logs
 
-    def policy(self, run: int) -> tuple[str, list[tuple[Tensor, Tensor]]]:
+    def policy(self, run: int) -> PolicyParts:
         """Return the actor: tanh of its output."""
-        return "tanh", self.actor.layers(run)
+        return PolicyParts("tanh", self.actor.layers(run))
+
+
+# Ours, beyond the paper; all of it off by default.
+
+
+def learned_beta_loss(learned_beta: Learned, cloning: Tensor, c: Any) -> Tensor:
+    """Return the loss [runs] of a learned beta = sigmoid(b): beta (cloning error - target).
+
+    1 - beta is the multiplier of the constraint "cloning error <= beta_target": an error above the target lowers
+    beta, so cloning holds tighter; one below it raises beta, and the discriminator takes over.
+    """
+    error: Tensor = cloning - c.beta_target
+    return learned_beta.flat[0, :, 0].sigmoid() * error
+
+
+def conservative_penalty(critic: Network, actor: Network, batch: Batch, uniform: Tensor) -> Tensor:
+    """Return mean [logsumexp_j Q(s, a_j) - Q(s, a)], critics summed, [runs].
+
+    a_j: the uniform actions [runs, n, batch, act], pi(s) and pi(s'). A deterministic actor has no density, so they are
+    not importance-weighted: the second of the three variants in the CQL authors' code.
+    """
+    with torch.no_grad():
+        here, there = (actor(s)[0].tanh().unsqueeze(1) for s in (batch.observations, batch.next_observations))
+        actions = torch.cat([uniform, here, there], 1)
+    runs, n, size, _ = actions.shape
+    repeated = batch.observations.unsqueeze(1).expand(runs, n, size, -1).reshape(runs, n * size, -1)
+    q = critic(repeated, actions.reshape(runs, n * size, -1)).view(-1, runs, n, size)
+    data = critic(batch.observations, batch.actions).squeeze(-1)
+    return (q.logsumexp(2) - data).mean(-1).sum(0)

@@ -8,6 +8,7 @@ critics are pushed down where the policy or chance would act, and up on the data
                  a_j: N uniform (w = 0.5^dim), N ~ pi(s), N ~ pi(s'), each with its own density; all Q at s
     actor        mean [ temperature log pi(a|s) - min_i Q_i(s, a) ],  a ~ pi(s)
                  in the first `bc_steps` updates: mean [ temperature log pi(a|s) - log pi(data's action|s) ]
+                 lagrange: multiplier (penalty - target_action_gap), the multiplier trained to raise it
     temperature  loss = -log(temperature) mean [ log pi(a|s) + target entropy ],  target entropy = -dim(A)
 
 Deviations: the actor sees the critics after their update, as in SB3 (the authors compute its loss just before);
@@ -25,7 +26,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from offbench.algorithm import Batch, Draw
+from offbench.algorithm import Batch, Draw, PolicyParts
 from offbench.networks import Learned, Network, Target
 from offbench.settings import setting
 
@@ -38,6 +39,9 @@ class Config:
     """Settings of CQL (the BDB paper's Table 5)."""
 
     alpha: float = setting(10.0, "weight of the conservative penalty", low=0, per_run=True)
+    lagrange: bool = setting(False, "scale the penalty by a multiplier that holds it at target_action_gap")
+    target_action_gap: float = setting(5.0, "what the Lagrange form holds the penalty at", above=0)
+    eval_samples: int = setting(1, "act with the best of so many samples by Q1; 1 acts with the mode", low=1)
     num_actions: int = setting(10, "actions of each of the three kinds in the log-sum-exp", low=1)
     bc_steps: int = setting(40_000, "updates in which the actor clones the data first", low=0)
     discount: float = setting(0.99, "discount", low=0, high=1)
@@ -99,18 +103,26 @@ def conservative_penalty(
 
 
 def critic_loss(
-    critic: Network, critic_target: Target, actor: Network, batch: Batch, noise: Mapping[str, Tensor], c: Any
+    critic: Network,
+    critic_target: Target,
+    actor: Network,
+    multiplier: Tensor | None,
+    batch: Batch,
+    noise: Mapping[str, Tensor],
+    c: Any,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the critics' loss [runs], and what is logged."""
+    """Return the critics' loss [runs], and what is logged; `multiplier` [runs] is the Lagrange form's."""
     with torch.no_grad():
         next_actions, _ = sample(actor, batch.next_observations, noise["target"])
         next_q = critic_target(batch.next_observations, next_actions[:, 0]).squeeze(-1).amin(0)
         target = batch.rewards + c.discount * batch.masks * next_q
     q = critic(batch.observations, batch.actions).squeeze(-1)  # [critics, runs, batch]
     td = (q - target).square().mean(-1).sum(0)
-    penalty = conservative_penalty(critic, actor, batch, noise, q).sum(0)
-    logs = {"critic_loss": td.detach(), "penalty": penalty.detach(), "q_abs": q[0].detach().abs().mean(-1)}
-    return td + c.alpha * penalty, logs
+    penalty = c.alpha * conservative_penalty(critic, actor, batch, noise, q)  # [critics, runs]
+    logs = {"critic_loss": td.detach(), "penalty": penalty.detach().sum(0), "q_abs": q[0].detach().abs().mean(-1)}
+    if multiplier is None:
+        return td + penalty.sum(0), logs
+    return td + multiplier * (penalty - c.target_action_gap).sum(0), logs
 
 
 def actor_loss(
@@ -161,11 +173,13 @@ class CQL:
         )
         self.critic_target = Target(self.critic)
         self.log_temperature = Learned(torch.zeros(1, len(run_seeds), 1, device=device), c.actor_learning_rate)
+        self.log_multiplier = Learned(torch.zeros(1, len(run_seeds), 1, device=device), c.critic_learning_rate)
         self.learned = {
             "actor": self.actor,
             "critic": self.critic,
             "critic_target": self.critic_target,
             "log_temperature": self.log_temperature,
+            "log_multiplier": self.log_multiplier,
         }
 
     @property
@@ -188,8 +202,14 @@ class CQL:
     def update(self, batch: Batch, noise: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
         """One update of every run."""
         c = self.config
-        loss, logs = critic_loss(self.critic, self.critic_target, self.actor, batch, noise, c)
+        multiplier = self.log_multiplier.flat[0, :, 0].exp().clamp(max=1e6)  # [runs]
+        held = multiplier.detach() if c.lagrange else None
+        loss, logs = critic_loss(self.critic, self.critic_target, self.actor, held, batch, noise, c)
         self.critic.minimize(loss.sum())
+        if c.lagrange:
+            gap = logs["penalty"] - 2 * c.target_action_gap  # of both critics
+            self.log_multiplier.minimize(-0.5 * (multiplier * gap).sum())
+            logs["multiplier"] = multiplier.detach()
         log_temperature = self.log_temperature.flat[0, :, 0]  # [runs]
         temperature = log_temperature.detach().exp()
         loss, more = actor_loss(self.actor, self.critic, temperature, batch, noise["actor"], kind == "cloning")
@@ -199,6 +219,8 @@ class CQL:
         self.critic_target.follow(c.tau)
         return logs | more | {"temperature": temperature}
 
-    def policy(self, run: int) -> tuple[str, list[tuple[Tensor, Tensor]]]:
-        """Return the actor: mean and log std before the tanh."""
-        return "squashed_gaussian", self.actor.layers(run)
+    def policy(self, run: int) -> PolicyParts:
+        """Return the actor, mean and log std before the tanh; Q1 with it if it acts with the best of samples."""
+        if self.config.eval_samples == 1:
+            return PolicyParts("squashed_gaussian", self.actor.layers(run))
+        return PolicyParts("best_by_q", self.actor.layers(run), self.critic.layers(run), self.config.eval_samples)

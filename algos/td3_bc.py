@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from offbench.algorithm import Batch, Draw
+from offbench.algorithm import Batch, Draw, PolicyParts
 from offbench.networks import Network, Target
 from offbench.settings import setting
 
@@ -121,6 +121,6 @@ class TD3BC:
             logs |= more
         return logs
 
-    def policy(self, run: int) -> tuple[str, list[tuple[Tensor, Tensor]]]:
+    def policy(self, run: int) -> PolicyParts:
         """Return the actor: tanh of its output."""
-        return "tanh", self.actor.layers(run)
+        return PolicyParts("tanh", self.actor.layers(run))

@@ -1,6 +1,7 @@
 """What an algorithm is.
 
-    class Config            frozen dataclass of `setting`s: CLI flags, help, config.json
+    class Config            frozen dataclass of `setting`s: CLI flags, help, config.json; the training itself
+                            reads batch_size, normalize and, if there is one, top (share of best episodes)
     class Algorithm(config, observation_dim, action_dim, run_seeds, device)
         draws               the random numbers of one update, by name
         kind(step)          which sort of update comes at a step
@@ -48,6 +49,19 @@ class Draw(NamedTuple):
     distribution: Literal["normal", "uniform"]  # uniform in [-1, 1]
 
 
+class PolicyParts(NamedTuple):
+    """A policy file's kind (see offbench/policy.py) and weights, each layer (weight [in, out], bias [out]).
+
+    Attributes:
+        critic, samples: for the kind `best_by_q` alone: Q of (observation, action), and how many to choose from.
+    """
+
+    kind: str
+    layers: list[tuple[Tensor, Tensor]]
+    critic: list[tuple[Tensor, Tensor]] = []  # noqa: RUF012 (never changed)
+    samples: int = 1
+
+
 class Keeps(Protocol):
     """Something whose tensors belong into a checkpoint (a network, a target, a temperature)."""
 
@@ -82,15 +96,15 @@ class Algorithm(Protocol):
         """Do one update in place; return what is logged, each [runs]."""
         ...
 
-    def policy(self, run: int) -> tuple[str, list[tuple[Tensor, Tensor]]]:
-        """Return the policy file's kind and layers of one run."""
+    def policy(self, run: int) -> PolicyParts:
+        """Return what the policy file of one run is made of."""
         ...
 
 
 def stack_configs(configs: Sequence[Any], device: torch.device | str) -> Any:
     """Return one config for a stack: `per_run` settings as tensors [runs], the others as they are.
 
-    A word among numbers (beta = "adaptive") becomes NaN in the tensor.
+    A word among numbers (beta = "adaptive") becomes -1 minus its place among the setting's choices.
 
     Raises:
         OffbenchError: the runs differ in a setting that cannot differ within a stack.
@@ -99,7 +113,8 @@ def stack_configs(configs: Sequence[Any], device: torch.device | str) -> Any:
     for field in dataclasses.fields(configs[0]):
         column = [getattr(config, field.name) for config in configs]
         if field.metadata.get("per_run"):
-            numbers = [float("nan") if isinstance(value, str) else float(value) for value in column]
+            words = field.metadata.get("choices") or ()
+            numbers = [-1.0 - words.index(value) if isinstance(value, str) else float(value) for value in column]
             values[field.name] = torch.tensor(numbers, dtype=torch.float32, device=device)
         elif any(value != column[0] for value in column):
             raise OffbenchError(f"runs of one stack cannot differ in {field.name}")

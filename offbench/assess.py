@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from offbench.errors import OffbenchError
+from offbench.files import write_json
 from offbench.policy import Policy, load_policy
 from offbench.recipes import d4rl_constants, env_spec, load_recipe
 from offbench.rollout import Rollouts, make_env, result
 from offbench.runs import Run
 from offbench.scores import interval, normalize
-from offbench.seeds import Purpose
+from offbench.seeds import Purpose, generator
 from offbench.workers import default_workers
 
 
@@ -91,6 +93,63 @@ def evaluate(
     known = config.get("references") or {"d4rl": d4rl_constants(policy.env_id)}
     scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in known.items() if pair}
     return Evaluation(str(path), policy.env_id, returns, [o.length for o in outcomes], scores)
+
+
+def similarity(
+    path: str | Path,
+    *,
+    tolerance: float = 0.05,
+    action_tolerance: float = 0.1,
+    samples: int = 2560,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Return a run's similar score in both readings, in percent, and write it to the run's similarity.json.
+
+    The BDB paper's Table 2 gives no formula; its numbers count samples of a batch of 256 that pass a yes/no test
+    "based on the current Q-value". Our reading:
+
+        q_similar       |Q1(s, pi(s)) - Q1(s, a)| <= tolerance |Q1(s, a)|
+        action_similar  root mean square of pi(s) - a over the dimensions <= action_tolerance, actions in [-1, 1]
+
+    Args:
+        samples: transitions drawn from the run's dataset (ten batches of 256).
+
+    Raises:
+        OffbenchError: no run or checkpoint there, or the algorithm has no critic.
+    """
+    import torch  # `evaluate` alone does without
+
+    from offbench.launch import restore
+    from offbench.networks import Network
+
+    run = Run(Path(path))
+    stack = restore(run)
+    critic = stack.algorithm.learned.get("critic")
+    if not isinstance(critic, Network):
+        raise OffbenchError(f"{path}: {run.config()['algorithm']} has no critic to compare by")
+    rng = generator(seed, Purpose.SAMPLE)
+    batch = stack.store.batch(torch.from_numpy(rng.integers(stack.store.sizes[0], size=(1, samples))))
+    policy = dataclasses.replace(  # acts on normalised observations, in [-1, 1], as the critic sees them
+        stack.policy(0),
+        observation_mean=np.zeros_like(stack.policy(0).observation_mean),
+        observation_std=np.ones_like(stack.policy(0).observation_std),
+        low=-np.ones_like(stack.policy(0).low),
+        high=np.ones_like(stack.policy(0).high),
+    )
+    noise = policy.draw(rng, samples) if policy.needs_noise(deterministic=True) else None
+    pi = torch.from_numpy(policy.act(batch.observations[0].numpy(), noise)).unsqueeze(0)
+    q_pi, q_data = (critic.frozen(batch.observations, a, copies=1).flatten() for a in (pi, batch.actions))
+    distance = (pi - batch.actions).square().mean(-1).sqrt().flatten()
+    found = {
+        "step": stack.step,
+        "samples": samples,
+        "q_similar": 100 * float(((q_pi - q_data).abs() <= tolerance * q_data.abs()).float().mean()),
+        "tolerance": tolerance,
+        "action_similar": 100 * float((distance <= action_tolerance).float().mean()),
+        "action_tolerance": action_tolerance,
+    }
+    write_json(run.folder / "similarity.json", found)
+    return found
 
 
 def _spec(policy: Policy, config: Mapping[str, Any], env: str | None) -> str:

@@ -171,12 +171,23 @@ def _evaluate(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--episodes", type=whole, default=10, help="default: 10")
     parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mode")
+    parser.add_argument("--similarity", action="store_true", help="a run's similar score on its dataset, no episodes")
+    parser.add_argument("--tolerance", type=number, default=0.05, help="of the similar score, share of |Q|")
+    parser.add_argument("--action-tolerance", type=number, default=0.1, help="of its second reading")
     parser.add_argument("--workers", type=whole, help="processes (default: one a core)")
 
-    def run(**arguments: Any) -> None:
-        from offbench.assess import evaluate
+    def run(similarity: bool, tolerance: float, action_tolerance: float, **arguments: Any) -> None:
+        from offbench import assess
 
-        print("\n".join(evaluate(**arguments).lines()))
+        if not similarity:
+            print("\n".join(assess.evaluate(**arguments).lines()))
+            return
+        found = assess.similarity(
+            arguments["path"], tolerance=tolerance, action_tolerance=action_tolerance, seed=arguments["seed"]
+        )
+        print(f"{arguments['path']}: similar score at step {found['step']:,} over {found['samples']:,} transitions")
+        print(f"by Q       {found['q_similar']:.2f}%  (within {100 * tolerance:g}% of |Q1(s, a)|)")
+        print(f"by action  {found['action_similar']:.2f}%  (root mean square distance at most {action_tolerance:g})")
 
     parser.set_defaults(run=run)
 

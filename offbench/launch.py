@@ -10,14 +10,14 @@ from typing import Any
 
 import torch
 
-from offbench import transitions
+from offbench import checkpoints, transitions
 from offbench.errors import OffbenchError
 from offbench.provenance import hardware, versions, warn_other_physics
 from offbench.recipes import d4rl_constants
 from offbench.registry import load_algorithm
 from offbench.runs import Run, run_folder, settings_dict, variant
-from offbench.settings import check, fields
-from offbench.training import Member, Schedule, Trainer
+from offbench.settings import build, check, fields
+from offbench.training import Member, Schedule, Stack, Trainer
 from offbench.transitions import Transitions
 from offbench.workers import cores
 
@@ -125,6 +125,28 @@ def pick_device(device: str) -> str:
             f"no device {device}: PyTorch {torch.__version__} sees {found} GPUs here; use --device cpu"
         )
     return device
+
+
+def restore(run: Run) -> Stack:
+    """Return a run's learning state from its newest checkpoint, on the CPU.
+
+    Raises:
+        OffbenchError: no run, no checkpoint, or its dataset is gone or changed.
+    """
+    config = run.config()
+    kind = load_algorithm(config["algorithm"])
+    settings: Any = build(kind.Config, config["settings"], f"{run.config_path}: settings")
+    data = transitions.load(config["dataset"])
+    if data.content != config["dataset_sha256"]:
+        raise OffbenchError(f"{data.dataset_id} is no longer the dataset that {run.folder} was trained on")
+    found = checkpoints.load_newest(run.folder)
+    if found is None:
+        raise OffbenchError(f"{run.folder} has no checkpoint yet; train it to its first one")
+    tensors, state = found
+    stack = Stack(kind, [Member(run, config["seed"], settings, data, references(data))], "cpu")
+    stack.load(0, tensors)
+    stack.step = int(state["step"])
+    return stack
 
 
 def references(data: Transitions) -> tuple[float, float] | None:

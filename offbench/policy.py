@@ -3,6 +3,7 @@
     W0 [obs, h]  b0 [h]  W1 [h, h]  b1 [h]  W2 [h, out]  b2 [out]        (x @ W + b, relu between)
     kind "tanh"               out = act          action = tanh(out)
     kind "squashed_gaussian"  out = 2 x act      action = tanh(mean + std * noise), log std clipped to [-20, 2]
+    kind "best_by_q"          the squashed Gaussian's best of `samples` actions by Q(observation, action in [-1, 1])
     kind "uniform"            no weights         action = uniform in the bounds
 
 The forward runs in float64 and rounds the action to float32 at its end. Matrix products differ in their last
@@ -13,6 +14,7 @@ number of workers and, but for rare ties, on any machine with the same physics.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 from dataclasses import dataclass
@@ -28,7 +30,9 @@ from offbench.errors import OffbenchError
 from offbench.files import write_bytes
 
 Array = npt.NDArray[Any]
-KINDS = ("tanh", "squashed_gaussian", "uniform")
+KINDS = ("tanh", "squashed_gaussian", "best_by_q", "uniform")
+Layers = tuple[tuple[Array, Array], ...]
+NETWORKS = ("layers", "critic")
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # Stable-Baselines3's bounds, and CQL's
 
 
@@ -43,42 +47,55 @@ class Policy:
         low, high: [act], the bounds of the environment's action space.
         env_id: the environment it was trained for.
         origin: provenance, anything JSON: algorithm, training step, dataset, seed.
+        critic, samples: of the kind `best_by_q`: layers of Q, and how many actions it chooses from.
     """
 
     kind: str
-    layers: tuple[tuple[Array, Array], ...]
+    layers: Layers
     observation_mean: Array
     observation_std: Array
     low: Array
     high: Array
     env_id: str
     origin: dict[str, Any] = dataclasses.field(default_factory=dict)
+    critic: Layers = ()
+    samples: int = 1
 
-    def __post_init__(self) -> None:
-        """Prepare the float64 copies that `act` uses, once."""
-        double = tuple((w.astype(np.float64), b.astype(np.float64)) for w, b in self.layers)
-        object.__setattr__(self, "_double", double)
-        object.__setattr__(self, "_low", self.low.astype(np.float64))
-        object.__setattr__(self, "_span", (self.high.astype(np.float64) - self._low) / 2)  # type: ignore[attr-defined]
+    @functools.cached_property
+    def _double(self) -> tuple[Layers, Layers, Array, Array]:
+        """Actor, critic, lowest action and half the span of actions in float64, converted once."""
+        actor, critic = (
+            tuple((w.astype(np.float64), b.astype(np.float64)) for w, b in net) for net in (self.layers, self.critic)
+        )
+        low = self.low.astype(np.float64)
+        return actor, critic, low, (self.high.astype(np.float64) - low) / 2
 
     @property
     def stochastic(self) -> bool:
-        """True if `act` can use noise."""
-        return self.kind != "tanh"
+        """True if its actions can be sampled."""
+        return self.kind in ("squashed_gaussian", "uniform")
+
+    def needs_noise(self, deterministic: bool) -> bool:
+        """Return whether `act` must be given noise: to sample, or to have actions to choose from."""
+        return self.kind == "best_by_q" or (self.stochastic and not deterministic)
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Return the noise of `count` actions, [count, act]: normal, or uniform in [-1, 1]."""
+        """Return the noise of `count` actions, [count, act]: normal, or uniform in [-1, 1].
+
+        For `best_by_q` it is [count, samples, act].
+        """
         shape = (count, len(self.low))
-        return rng.uniform(-1.0, 1.0, shape) if self.kind == "uniform" else rng.standard_normal(shape)
+        if self.kind == "uniform":
+            return rng.uniform(-1.0, 1.0, shape)
+        return rng.standard_normal((count, self.samples, len(self.low)) if self.kind == "best_by_q" else shape)
 
     def act(self, observations: Array, noise: Array | None) -> npt.NDArray[np.float32]:
         """Return the actions [n, act] for observations [n, obs], in the environment's bounds.
 
         Args:
-            noise: [n, act] from `draw`, or None to act deterministically (the mode; uniform has none: zeros).
+            noise: from `draw`, or None to act deterministically (the mode; uniform has none: zeros).
         """
-        span: Array = self._span  # type: ignore[attr-defined]
-        low: Array = self._low  # type: ignore[attr-defined]
+        _, _, low, span = self._double
         squashed = self._squashed(observations, noise)
         # +1 before scaling keeps both ends exact: tanh = -1 gives low, tanh = 1 gives high
         return np.clip(low + (squashed + 1.0) * span, self.low, self.high).astype(np.float32)
@@ -86,32 +103,34 @@ class Policy:
     def _squashed(self, observations: Array, noise: Array | None) -> Array:
         if self.kind == "uniform":
             return np.zeros((len(observations), len(self.low))) if noise is None else noise
+        actor, critic, _, _ = self._double
         x = (np.asarray(observations, np.float64) - self.observation_mean) / self.observation_std
-        layers: tuple[tuple[Array, Array], ...] = self._double  # type: ignore[attr-defined]
-        for weight, bias in layers[:-1]:
-            x = x @ weight
-            x += bias
-            np.maximum(x, 0.0, out=x)
-        weight, bias = layers[-1]
-        x = x @ weight + bias
+        out = _forward(actor, x)
         if self.kind == "tanh":
-            return np.tanh(x)
-        mean, log_std = np.split(x, 2, axis=-1)
-        if noise is not None:
-            mean = mean + np.exp(np.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)) * noise
-        return np.tanh(mean)
+            return np.asarray(np.tanh(out))
+        mean, log_std = np.split(out, 2, axis=-1)
+        std = np.exp(np.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
+        if noise is None or self.kind == "squashed_gaussian":
+            return np.asarray(np.tanh(mean if noise is None else mean + std * noise))
+        actions = np.tanh(mean[:, None] + std[:, None] * noise)  # [n, samples, act]
+        repeated = np.broadcast_to(x[:, None], (*actions.shape[:2], x.shape[1]))
+        best = _forward(critic, np.concatenate([repeated, actions], -1))[..., 0].argmax(1)
+        chosen: Array = actions[np.arange(len(actions)), best]
+        return chosen
 
     def to_bytes(self) -> bytes:
         """Return the policy file's content."""
         tensors: dict[str, Array] = {"low": self.low, "high": self.high}
         tensors |= {"observation_mean": self.observation_mean, "observation_std": self.observation_std}
-        for i, (weight, bias) in enumerate(self.layers):
-            tensors |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
+        for net, layers in zip(NETWORKS, (self.layers, self.critic), strict=True):
+            for i, (weight, bias) in enumerate(layers):
+                tensors |= {f"{net}.{i}.weight": weight, f"{net}.{i}.bias": bias}
         header = {
             "format": "offbench-policy-1",
             "kind": self.kind,
             "env_id": self.env_id,
             "origin": self.origin,
+            "samples": self.samples,
         }
         arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in tensors.items()}
         return bytes(save(arrays, metadata={"offbench": json.dumps(header, sort_keys=True)}))
@@ -119,6 +138,17 @@ class Policy:
     def save(self, path: Path) -> None:
         """Write the policy file, whole or not at all."""
         write_bytes(path, self.to_bytes())
+
+
+def _forward(layers: Layers, x: Array) -> Array:
+    """Return the last layer's output, relu between layers."""
+    for weight, bias in layers[:-1]:
+        x = x @ weight
+        x += bias
+        np.maximum(x, 0.0, out=x)
+    weight, bias = layers[-1]
+    out: Array = x @ weight + bias
+    return out
 
 
 def uniform(low: Array, high: Array, observation_dim: int, env_id: str) -> Policy:
@@ -147,18 +177,21 @@ def from_bytes(data: bytes) -> Policy:
     kind = header.get("kind")
     if header.get("format") != "offbench-policy-1" or kind not in KINDS:
         raise ValueError(f"unknown format {header.get('format')!r} or kind {kind!r}")
-    count = sum(name.endswith(".weight") for name in tensors)
-    names = [f"layers.{i}.{part}" for i in range(count) for part in ("weight", "bias")]
+    sizes = {net: sum(n.startswith(f"{net}.") and n.endswith(".weight") for n in tensors) for net in NETWORKS}
+    names = [f"{net}.{i}.{part}" for net, n in sizes.items() for i in range(n) for part in ("weight", "bias")]
     wanted = {*names, "low", "high", "observation_mean", "observation_std"}
     if set(tensors) != wanted:
         raise ValueError(f"tensors {sorted(wanted.symmetric_difference(tensors))} are missing or too many")
-    layers = tuple((tensors[f"layers.{i}.weight"], tensors[f"layers.{i}.bias"]) for i in range(count))
-    env_id, origin = header.get("env_id"), header.get("origin")
-    if not isinstance(env_id, str) or not isinstance(origin, dict):
-        raise ValueError("its header lacks env_id or origin")
+    env_id, origin, samples = header.get("env_id"), header.get("origin"), header.get("samples", 1)
+    if not isinstance(env_id, str) or not isinstance(origin, dict) or not isinstance(samples, int) or samples < 1:
+        raise ValueError("its header lacks env_id or origin, or has odd samples")
+    layers, critic = (
+        tuple((tensors[f"{net}.{i}.weight"], tensors[f"{net}.{i}.bias"]) for i in range(n)) for net, n in sizes.items()
+    )
     mean, std, low, high = (tensors[name] for name in ("observation_mean", "observation_std", "low", "high"))
-    _check_shapes(kind, layers, mean, std, low, high)
-    return Policy(kind, layers, mean, std, low, high, env_id, origin)
+    policy = Policy(kind, layers, mean, std, low, high, env_id, origin, critic, samples)
+    _check_shapes(policy)
+    return policy
 
 
 def _header(data: bytes) -> dict[str, Any]:
@@ -171,24 +204,32 @@ def _header(data: bytes) -> dict[str, Any]:
     return header if isinstance(header, dict) else {}
 
 
-def _check_shapes(
-    kind: str, layers: tuple[tuple[Array, Array], ...], mean: Array, std: Array, low: Array, high: Array
-) -> None:
-    arrays = [mean, std, low, high, *(a for pair in layers for a in pair)]
+def _check_shapes(p: Policy) -> None:
+    arrays = [p.observation_mean, p.observation_std, p.low, p.high, *(a for pair in p.layers + p.critic for a in pair)]
     if any(a.dtype != np.float32 for a in arrays):
         raise ValueError("every tensor must be float32")
     if not all(np.isfinite(a).all() for a in arrays):
         raise ValueError("it holds NaN or infinite numbers")
-    if any(a.ndim != 1 for a in (mean, std, low, high)) or mean.shape != std.shape or low.shape != high.shape:
+    dim, act = p.observation_mean.shape, p.low.shape
+    if any(a.ndim != 1 for a in arrays[:4]) or dim != p.observation_std.shape or act != p.high.shape:
         raise ValueError("the shapes of bounds or normalisation do not agree")
-    if kind == "uniform":
+    if p.kind == "uniform":
         return
-    if (std <= 0).any() or (high <= low).any() or not layers:
-        raise ValueError("it has no layers, a std that is not positive, or bounds out of order")
-    width = len(mean)
+    if (p.observation_std <= 0).any() or (p.high <= p.low).any():
+        raise ValueError("a std is not positive, or bounds are out of order")
+    outputs = act[0] * (1 if p.kind == "tanh" else 2)
+    _check_layers(p.layers, dim[0], outputs)
+    if p.kind == "best_by_q":
+        _check_layers(p.critic, dim[0] + act[0], 1)
+
+
+def _check_layers(layers: Layers, inputs: int, outputs: int) -> None:
+    if not layers:
+        raise ValueError("it has no layers")
+    width = inputs
     for weight, bias in layers:
         if weight.ndim != 2 or bias.shape != weight.shape[1:] or weight.shape[0] != width:
             raise ValueError(f"a layer of shape {weight.shape} does not follow {width} inputs")
         width = weight.shape[1]
-    if width != len(low) * (2 if kind == "squashed_gaussian" else 1):
-        raise ValueError(f"{width} outputs do not fit {len(low)} actions")
+    if width != outputs:
+        raise ValueError(f"{width} outputs where {outputs} are needed")

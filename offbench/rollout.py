@@ -132,7 +132,7 @@ class _Lane:
 def play(task: Task) -> list[Episode] | list[Outcome]:
     """Play a task's episodes and return them in its order."""
     policy = _policy(task.policy)
-    noisy = policy.stochastic and not task.deterministic
+    noisy = policy.needs_noise(task.deterministic)
     envs = _envs(task.spec, min(LANES, len(task.indices)))
     waiting = iter(range(len(task.indices)))
     lanes = [_Lane(env, policy, task, slot) for env, slot in zip(envs, waiting, strict=False)]

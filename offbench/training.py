@@ -65,19 +65,26 @@ class Store:
 
     def __init__(self, members: Sequence[Member], normalize_observations: bool, device: torch.device) -> None:
         distinct = {member.data.dataset_id: member.data for member in members}
-        starts, first, row = {}, 0, 0
+        starts, count, row = {}, 0, 0
         parts: dict[str, list[Tensor]] = {k: [] for k in ("observations", "rows", "actions", "rewards", "masks")}
         for name, data in distinct.items():
-            starts[name] = first
+            starts[name] = count
             for key, tensors in parts.items():
                 array = getattr(data, key)
                 tensors.append(_tensor(array + row if key == "rows" and row else array))
-            first, row = first + len(data), row + len(data.observations)
+            count, row = count + len(data), row + len(data.observations)
         whole = {key: (t[0] if len(t) == 1 else torch.cat(t)).to(device) for key, t in parts.items()}
         self.observations, self.rows = whole["observations"], whole["rows"]
         self.actions, self.rewards, self.masks = whole["actions"], whole["rewards"], whole["masks"]
         self.sizes = [len(member.data) for member in members]
-        self.first = torch.tensor([starts[m.data.dataset_id] for m in members], device=device).view(-1, 1)
+        first = [starts[member.data.dataset_id] for member in members]
+        self.chosen: Tensor | None = None  # where runs train on a part: the transitions of each, end to end
+        if any(getattr(member.config, "top", 1.0) < 1 for member in members):
+            chosen = [m.data.best(getattr(m.config, "top", 1.0)) + f for m, f in zip(members, first, strict=True)]
+            self.sizes = [len(part) for part in chosen]
+            first = [sum(self.sizes[:i]) for i in range(len(members))]
+            self.chosen = torch.from_numpy(np.concatenate(chosen)).to(device)
+        self.first = torch.tensor(first, device=device).view(-1, 1)
         known = {name: data.normalizer() for name, data in distinct.items()} if normalize_observations else {}
         dim = self.observations.shape[1]
         identity = (np.zeros(dim, np.float32), np.ones(dim, np.float32))
@@ -89,6 +96,8 @@ class Store:
     def batch(self, indices: Tensor) -> Batch:
         """Return the transitions at `indices` [runs, batch], each run's counted from its own first."""
         flat = (indices + self.first).flatten()
+        if self.chosen is not None:
+            flat = self.chosen[flat]
         rows = self.rows[flat]
         shape = (*indices.shape, -1)
         observations = self.observations[rows].view(shape)
@@ -184,13 +193,24 @@ class Stack:
     def policy(self, run: int) -> Policy:
         """Return one run's policy as it is now, for the NumPy rollouts and the policy file."""
         member = self.members[run]
-        kind, layers = self.algorithm.policy(run)
+        parts = self.algorithm.policy(run)
         mean, std = self.store.normalizers[run]
         origin = {"algorithm": type(self.algorithm).__name__, "step": self.step, "seed": member.seed}
-        weights = tuple((w.numpy(), b.numpy()) for w, b in layers)
+        actor, critic = (tuple((w.numpy(), b.numpy()) for w, b in p) for p in (parts.layers, parts.critic))
         data = member.data
         origin |= {"dataset": data.dataset_id, "dataset_sha256": data.content}
-        return Policy(kind, weights, mean, std, data.low, data.high, data.env_id, origin)
+        return Policy(
+            parts.kind,
+            actor,
+            mean,
+            std,
+            data.low,
+            data.high,
+            data.env_id,
+            origin,
+            critic=critic,
+            samples=parts.samples,
+        )
 
     def run_tensors(self, run: int) -> dict[str, Tensor]:
         """Return what one run's checkpoint keeps: its slice of everything learned."""

@@ -66,6 +66,14 @@ class Transitions:
         """The environment's id, for the policy file; empty if the dataset does not name one."""
         return str(json.loads(self.env_spec).get("id", "")) if self.env_spec else ""
 
+    def best(self, share: float) -> Array:
+        """Return the indices of the transitions of the best `share` of all episodes by return, in order."""
+        count = max(1, round(share * len(self.ends)))
+        lengths = np.diff(self.ends, prepend=0)
+        chosen = np.zeros(len(self.ends), bool)
+        chosen[np.argsort(-self.returns, kind="stable")[:count]] = True
+        return np.flatnonzero(np.repeat(chosen, lengths))
+
     def normalizer(self) -> tuple[Array, Array]:
         """Return mean and std + 1e-3 of the transitions' observations, [obs] float32, as TD3+BC's authors do."""
         count, dim = len(self), self.observations.shape[1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -12,7 +13,8 @@ from torch.distributions import Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 
 from offbench.algorithm import Batch, stack_configs
-from offbench.algos.cql import CQL, Config, actor_loss, conservative_penalty, critic_loss, log_prob, sample
+from offbench.algos.cql import CQL, Config, actor_loss, at_each, conservative_penalty, critic_loss, log_prob, sample
+from offbench.policy import Policy, from_bytes
 
 OBS, ACT, BATCH = 3, 2, 64
 
@@ -128,7 +130,13 @@ def test_the_actor_step_gives_the_critics_no_gradient() -> None:
 def test_the_critic_step_gives_the_actor_no_gradient() -> None:
     algorithm = make()
     loss, _ = critic_loss(
-        algorithm.critic, algorithm.critic_target, algorithm.actor, a_batch(), noise_for(algorithm), algorithm.config
+        algorithm.critic,
+        algorithm.critic_target,
+        algorithm.actor,
+        None,
+        a_batch(),
+        noise_for(algorithm),
+        algorithm.config,
     )
     (to_actor,) = torch.autograd.grad(loss.sum(), [algorithm.actor.flat], allow_unused=True)
     assert to_actor is None
@@ -144,7 +152,9 @@ def test_no_entropy_in_the_target() -> None:
         y = batch.rewards + 0.99 * torch.minimum(q[0], q[1])
         now = algorithm.critic.frozen(batch.observations, batch.actions).squeeze(-1)
         expected = ((now[0] - y) ** 2).mean() + ((now[1] - y) ** 2).mean()
-    loss, _ = critic_loss(algorithm.critic, algorithm.critic_target, algorithm.actor, batch, noise, algorithm.config)
+    loss, _ = critic_loss(
+        algorithm.critic, algorithm.critic_target, algorithm.actor, None, batch, noise, algorithm.config
+    )
     torch.testing.assert_close(loss[0], expected)
 
 
@@ -186,3 +196,43 @@ def test_the_penalty_keeps_q_off_the_data_below(alpha: float) -> None:
     elsewhere = algorithm.critic.frozen(batch.observations, noise_for(algorithm)["uniform"][:, 0]).mean()
     gap = (data - elsewhere).item()
     assert gap > 1 if alpha else abs(gap) < 1
+
+
+@pytest.mark.parametrize(("gap", "rises"), [(0.5, True), (500.0, False)])
+def test_the_lagrange_multiplier_holds_the_penalty_at_its_target(gap: float, rises: bool) -> None:
+    algorithm = make(lagrange=True, target_action_gap=gap, critic_learning_rate=3e-3, bc_steps=0)
+    for step in range(60):
+        logs = algorithm.update(a_batch(seed=step), noise_for(algorithm, step), "sac")
+    assert (logs["multiplier"].item() > 1.05) if rises else (logs["multiplier"].item() < 0.95)
+
+
+def test_the_lagrange_form_by_hand() -> None:
+    """td + multiplier (alpha penalty - gap), both critics, against the plain form's parts."""
+    algorithm, batch = make(alpha=3.0, target_action_gap=0.7), a_batch()
+    noise = noise_for(algorithm)
+    parts = algorithm.critic, algorithm.critic_target, algorithm.actor
+    plain, logs = critic_loss(*parts, None, batch, noise, algorithm.config)
+    held, _ = critic_loss(*parts, torch.tensor([2.5]), batch, noise, algorithm.config)
+    torch.testing.assert_close(held, logs["critic_loss"] + 2.5 * (logs["penalty"] - 1.4))
+    torch.testing.assert_close(plain, logs["critic_loss"] + logs["penalty"])
+
+
+def test_best_by_q_takes_the_sample_that_q1_likes_most() -> None:
+    """The policy file's choice in NumPy against the networks themselves."""
+    algorithm = make(eval_samples=6)
+    parts = algorithm.policy(0)
+    assert (parts.kind, parts.samples) == ("best_by_q", 6)
+    arrays = [tuple((w.numpy(), b.numpy()) for w, b in net) for net in (parts.layers, parts.critic)]
+    zeros, ones = np.zeros(OBS, np.float32), np.ones(OBS, np.float32)
+    bounds = -np.ones(ACT, np.float32), np.ones(ACT, np.float32)
+    policy = from_bytes(
+        Policy("best_by_q", arrays[0], zeros, ones, *bounds, "X-v0", {}, critic=arrays[1], samples=6).to_bytes()
+    )
+    assert policy.needs_noise(deterministic=True)
+    noise = policy.draw(np.random.default_rng(0), 32)
+    assert noise.shape == (32, 6, ACT)
+    observations = a_batch(batch=32).observations
+    actions, _ = sample(algorithm.actor, observations, torch.from_numpy(noise).float().transpose(0, 1).unsqueeze(0))
+    q = at_each(algorithm.critic, observations, actions)[0, 0]  # [samples, batch]
+    expected = actions[0, q.argmax(0), torch.arange(32)]
+    np.testing.assert_allclose(policy.act(observations[0].numpy(), noise), expected.detach().numpy(), atol=1e-5)

@@ -19,10 +19,20 @@ from offbench import checkpoints
 from offbench.agents import folder_of
 from offbench.errors import OffbenchError
 from offbench.recipes import load_recipe
+from offbench.registry import algorithm_names
 from offbench.runs import Run
 
 SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 100, "eval_episodes": 2}
-EXTRA: dict[str, dict[str, Any]] = {"td3_bc": {}, "bdb": {}, "cql": {"num_actions": 2, "bc_steps": 150}}
+EXTRA: dict[str, dict[str, Any]] = {
+    "td3_bc": {},
+    "bdb": {},
+    "bc": {},
+    "cql": {"num_actions": 2, "bc_steps": 150, "eval_samples": 3},
+}
+
+
+def test_every_algorithm_is_tested_here() -> None:
+    assert set(EXTRA) == set(algorithm_names())
 
 
 def train(algorithm: str, dataset: str, runs: str, steps: int, **more: Any) -> list[Run]:
@@ -30,7 +40,7 @@ def train(algorithm: str, dataset: str, runs: str, steps: int, **more: Any) -> l
     return [Run(path) for path in offbench.train(algorithm, dataset, steps=steps, runs=runs, **settings)]
 
 
-@pytest.mark.parametrize("algorithm", ["td3_bc", "bdb", "cql"])
+@pytest.mark.parametrize("algorithm", sorted(EXTRA))
 def test_a_run_stopped_and_resumed_ends_with_the_same_bits(medium: str, algorithm: str) -> None:
     (whole,) = train(algorithm, medium, "whole", 300)
     for steps in (100, 200, 300):

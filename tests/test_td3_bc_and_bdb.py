@@ -195,12 +195,13 @@ def test_adaptive_beta_is_one_over_the_spread_of_the_critics() -> None:
     q = algorithm.critic(batch.observations, pi).squeeze(-1).detach()
     spread = (q[0] - q[1]).abs()
     assert spread.min() < 1 < spread.max()
+    parts = algorithm.actor, algorithm.critic, algorithm.discriminator, algorithm.learned_beta
     expected = torch.where(spread < 1, torch.ones(()), 1 / spread)
-    _, logs = actor_loss(algorithm.actor, algorithm.critic, algorithm.discriminator, batch, algorithm.config)
+    _, logs = actor_loss(*parts, batch, algorithm.config, False)
     torch.testing.assert_close(logs["beta"], expected.mean(-1))
     torch.testing.assert_close(logs["uncertainty"], spread.mean(-1))
     algorithm.config.beta_scope = "batch"
-    _, logs = actor_loss(algorithm.actor, algorithm.critic, algorithm.discriminator, batch, algorithm.config)
+    _, logs = actor_loss(*parts, batch, algorithm.config, False)
     torch.testing.assert_close(logs["beta"], (1 / spread.mean(-1)).clamp(max=1))
 
 
@@ -210,3 +211,90 @@ def test_what_bdb_logs() -> None:
     assert wanted | {"adversarial", "q_abs", "critic_loss", "actor_loss", "discriminator_loss"} == set(log)
     assert all(value.shape == (2,) for value in log.values())
     assert log["beta"][1] == 0.5
+
+
+def beta_after(config: dict[str, Any], steps: int = 2) -> float:
+    algorithm = make("bdb", [config])
+    with torch.no_grad():
+        algorithm.critic.flat *= 4
+    logs = [log for log in run(algorithm, steps) if "beta" in log]
+    return logs[-1]["beta"].item()
+
+
+def test_remedies_for_an_early_beta_near_one() -> None:
+    adaptive = beta_after({"beta": "adaptive"})
+    assert beta_after({"beta": "adaptive", "beta_max": 0.2}) <= 0.2 < adaptive
+    assert beta_after({"beta": "adaptive", "cloning_steps": 2}) == 0.0
+    assert beta_after({"beta": "adaptive", "cloning_steps": 2}, steps=4) > 0.0
+    relative = [beta_after({"uncertainty": "relative", "uncertainty_scale": scale}) for scale in (1.0, 10.0)]
+    assert relative[0] > relative[1]
+    assert beta_after({"beta": 0.6, "beta_max": 0.2}) == pytest.approx(0.6)  # a fixed beta is what it says
+
+
+def test_relative_uncertainty_does_not_change_with_the_size_of_q() -> None:
+    from offbench.algos.bdb import uncertainty
+
+    found = []
+    for factor in (1.0, 50.0):
+        algorithm = make("bdb", [{"uncertainty": "relative"}])
+        batch, _ = next(batches(1))
+        with torch.no_grad():
+            last = HIDDEN[-1] + 1  # the weights and bias of the last layer scale Q itself
+            algorithm.critic.flat[..., -last:] *= factor
+        found.append(uncertainty(algorithm.critic, batch, batch.actions, algorithm.config))
+    torch.testing.assert_close(found[0], found[1])
+
+
+@pytest.mark.parametrize(("target", "rises"), [(1e-6, False), (10.0, True)])
+def test_a_learned_beta_holds_the_cloning_error_at_its_target(target: float, rises: bool) -> None:
+    algorithm = make("bdb", [{"beta": "learned", "beta_target": target, "beta_learning_rate": 1e-2}])
+    logs = [log["beta"].item() for log in run(algorithm, 100) if "beta" in log]
+    assert logs[0] == 0.5
+    assert (logs[-1] > 0.55) if rises else (logs[-1] < 0.45)
+
+
+def test_the_learned_betas_gradient_by_hand() -> None:
+    """d/db sigmoid(b) (error - target) = sigmoid(b) (1 - sigmoid(b)) (error - target)."""
+    from offbench.algos.bdb import learned_beta_loss
+
+    algorithm = make("bdb", [{"beta": "learned", "beta_target": 0.05}])
+    with torch.no_grad():
+        algorithm.learned_beta.flat.fill_(0.4)
+    loss = learned_beta_loss(algorithm.learned_beta, torch.tensor([0.3]), algorithm.config)
+    (gradient,) = torch.autograd.grad(loss.sum(), [algorithm.learned_beta.flat])
+    s = torch.sigmoid(torch.tensor(0.4))
+    torch.testing.assert_close(gradient.flatten(), (s * (1 - s) * 0.25).view(1))
+
+
+def test_the_critic_penalty_by_hand() -> None:
+    from offbench.algos.bdb import conservative_penalty
+
+    algorithm = make("bdb", [{"critic_penalty": "cql", "penalty_actions": 3}])
+    batch, _ = next(batches(1))
+    assert algorithm.draws["uniform"].shape == (3, BATCH, ACT)
+    uniform = torch.rand(1, 3, BATCH, ACT) * 2 - 1
+    found = conservative_penalty(algorithm.critic, algorithm.actor, batch, uniform)
+    expected = 0.0
+    with torch.no_grad():
+        for i in range(BATCH):
+            s, s2 = batch.observations[0, i], batch.next_observations[0, i]
+            actions = [*uniform[0, :, i], *(algorithm.actor(x.view(1, 1, -1)).tanh().flatten() for x in (s, s2))]
+            for c in range(2):
+                q = [algorithm.critic(s.view(1, 1, -1), a.view(1, 1, -1))[c].item() for a in actions]
+                data = algorithm.critic(s.view(1, 1, -1), batch.actions[0, i].view(1, 1, -1))[c].item()
+                expected += (torch.tensor(q, dtype=torch.float64).exp().sum().log().item() - data) / BATCH
+    assert found.item() == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_critic_penalty_lowers_q_off_the_data() -> None:
+    gaps = []
+    for weight in (0.0, 5.0):
+        config = {"critic_penalty": "cql", "penalty_weight": weight, "critic_learning_rate": 3e-3}
+        algorithm = make("bdb", [config])
+        batch, noise = next(batches(1))  # the same one again and again: there is a data set to stay near
+        for step in range(200):
+            uniform = torch.rand(1, 10, BATCH, ACT, generator=torch.Generator().manual_seed(step)) * 2 - 1
+            algorithm.update(batch, noise | {"uniform": uniform}, algorithm.kind(step))
+        on, off = (algorithm.critic(batch.observations, a).mean().item() for a in (batch.actions, -batch.actions))
+        gaps.append(on - off)
+    assert gaps[1] > gaps[0] + 0.3
