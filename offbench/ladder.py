@@ -4,7 +4,7 @@
         -> expert   the best of the late rungs, by measured return
         -> medium   the first rung at one third (to 0.45) of the expert's normalised return
         -> others   the rungs nearest 1/12, 2/12, ... of it, for `--level FRACTION`
-        -> ladder/  ladder.json  ladder.csv  policies/*.safetensors  medium-replay.npz
+        -> ladder/  ladder.json  ladder.csv  policies/*.safetensors  medium-replay.hdf5
 
 Returns are of the sampling policy, normalised between the uniform-random and the expert reference. A rung is
 chosen on one set of episodes; the expert's reference score is measured on another, so being chosen for its
@@ -90,7 +90,7 @@ class Ladder:
     @property
     def replay(self) -> Path:
         """The transitions of medium-replay."""
-        return self.folder / "medium-replay.npz"
+        return self.folder / "medium-replay.hdf5"
 
 
 def read_ladder(folder: Path) -> Ladder | None:
@@ -249,7 +249,7 @@ def _write(
             shutil.copyfile(training.policy(step), aside / "policies" / training.policy(step).name)
         write_bytes(aside / "ladder.csv", csv_bytes(COLUMNS, _table(training, rows, surveyor, roles)))
         info["medium_replay"] = save_replay(
-            aside / "medium-replay.npz", replay_episodes(training, info["levels"]["medium"])
+            aside / "medium-replay.hdf5", replay_episodes(training, info["levels"]["medium"])
         )
         write_json(aside / "ladder.json", info)
         shutil.rmtree(out, ignore_errors=True)

@@ -1,7 +1,7 @@
 """medium-replay: every transition of a behaviour agent's training up to the medium rung, as episodes.
 
 segment files [steps, envs, ...]  ->  per segment, per environment stream: episodes
-file: observations [N + E, obs] (T + 1 rows an episode, end to end)   actions [N, act] in [-1, 1]
+HDF5: observations [N + E, obs] (T + 1 rows an episode, end to end)   actions [N, act] in [-1, 1]
       rewards [N]   lengths [E]   terminated [E]   stream [E]         (N transitions, E episodes)
 """
 
@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import h5py
 import numpy as np
 
 from offbench.errors import OffbenchError
@@ -22,6 +23,7 @@ from offbench.rollout import Episode
 if TYPE_CHECKING:
     from offbench.sac import Training
 
+CHUNK_ROWS = 65_536
 NO_SEED = -1  # episodes of a training have no reset seed of their own
 
 
@@ -60,7 +62,7 @@ def _cut(arrays: dict[str, Array], stream: int) -> Iterator[Piece]:
 
 
 def save_replay(path: Path, pieces: Iterator[Piece]) -> dict[str, Any]:
-    """Write episodes to one compressed file; return its transitions, episodes and SHA-256."""
+    """Write episodes to one compressed HDF5 file; return its transitions, episodes and SHA-256."""
     whole = list(pieces)
     arrays: dict[str, Any] = {
         "observations": np.concatenate([p.observations for p in whole]).astype(np.float32),
@@ -71,7 +73,11 @@ def save_replay(path: Path, pieces: Iterator[Piece]) -> dict[str, Any]:
         "stream": np.array([p.stream for p in whole], np.int64),
     }
     data = io.BytesIO()
-    np.savez_compressed(data, **arrays)
+    with h5py.File(data, "w") as file:
+        for name, array in arrays.items():
+            # column by column and byte by byte: what the floats of one quantity share lies together
+            chunks = (min(len(array), CHUNK_ROWS), *(1 for _ in array.shape[1:]))
+            file.create_dataset(name, data=array, chunks=chunks, compression="gzip", compression_opts=6, shuffle=True)
     write_bytes(path, data.getvalue())
     return {"transitions": len(arrays["rewards"]), "episodes": len(whole), "sha256": sha256(data.getvalue())}
 
@@ -88,8 +94,8 @@ def load_replay(path: Path, expected_sha256: str, low: Array, high: Array, dtype
         raise OffbenchError(f"cannot read {path}: {error.strerror}; train the ladder anew with --retrain") from None
     if sha256(data) != expected_sha256:
         raise OffbenchError(f"{path} is damaged (its SHA-256 differs from the ladder's); reinstall or --retrain")
-    with np.load(io.BytesIO(data), allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
+    with h5py.File(io.BytesIO(data), "r") as file:
+        arrays = {name: values[()] for name, values in file.items()}
     span = (high.astype(np.float64) - low) / 2
     row = step = 0
     for length, terminated in zip(arrays["lengths"], arrays["terminated"], strict=True):

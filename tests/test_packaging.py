@@ -19,7 +19,7 @@ def shipped() -> set[str]:
     return {
         str(path.relative_to(ROOT))
         for path in (ROOT / "datasets").rglob("*")
-        if path.is_file() and path.suffix in (".toml", ".csv", ".json", ".safetensors", ".npz", ".md", ".png")
+        if path.is_file() and path.suffix in (".toml", ".csv", ".json", ".safetensors", ".hdf5", ".md", ".png")
     }
 
 

@@ -190,7 +190,7 @@ def test_behaviour_training_survives_kill_9(tiny: tuple[str, str], home: Path) -
     subprocess.run(command, check=True, capture_output=True)
     for path in sorted((whole / "policies").iterdir()):
         assert path.read_bytes() == (killed / "policies" / path.name).read_bytes()
-    assert (whole / "ladder" / "medium-replay.npz").exists()
+    assert (whole / "ladder" / "medium-replay.hdf5").exists()
     ours, theirs = ((folder / "ladder" / "ladder.csv").read_text().splitlines() for folder in (whole, killed))
     no_hours = [[cell for i, cell in enumerate(line.split(",")) if i != 1] for line in ours]
     assert no_hours == [[cell for i, cell in enumerate(line.split(",")) if i != 1] for line in theirs]
