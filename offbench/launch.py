@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -73,8 +74,40 @@ def train(
         member.run.claim(_config(algorithm, member, schedule, command))
     title = f"{algorithm} on {datasets[0].dataset_id}" + (f" ({len(members)} runs)" if len(members) > 1 else "")
     with _threads(place):
-        Trainer(kind, members, schedule, title).train()
+        for group in together(members, steps):
+            Trainer(kind, group, schedule, title).train()
     return [member.run.folder for member in members]
+
+
+def together(members: Sequence[Member], steps: int) -> list[list[Member]]:
+    """Sort runs into stacks that can go on from one common step; runs without a checkpoint begin together.
+
+    A stack that was killed while it wrote its checkpoints has runs a checkpoint apart: they go on from the older one.
+
+    Raises:
+        OffbenchError: a run is further than `steps` already.
+    """
+    known = {member.run.folder: set(checkpoints.steps(member.run.folder)) for member in members}
+    for folder, found in known.items():
+        if found and min(found) > steps:
+            raise OffbenchError(
+                f"{folder} is at step {max(found)} already; give --steps {max(found)} or more, or --runs"
+            )
+    # a run that is finished and evaluated is left alone
+    left = [m for m in members if steps not in known[m.run.folder] or (m.data.env_spec and not _evaluated(m, steps))]
+    groups = []
+    while left:
+        counts = Counter(step for member in left for step in known[member.run.folder] if step <= steps)
+        # the step that most runs share; among those the newest
+        best = max(counts, key=lambda step: (counts[step], step), default=None)
+        group = [m for m in left if best is None or best in known[m.run.folder]]
+        groups.append(group)
+        left = [member for member in left if member not in group]
+    return groups
+
+
+def _evaluated(member: Member, step: int) -> bool:
+    return step in member.run.evaluations()
 
 
 def _grid(cls: type, settings: Mapping[str, Any], algorithm: str) -> Iterator[dict[str, Any]]:

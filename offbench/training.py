@@ -258,8 +258,6 @@ class Trainer:
             for member in self.members:
                 resources.enter_context(held(member.run))
             self._resume()
-            if self._complete():
-                return
             spec = self.members[0].data.env_spec  # datasets of one stack are of one environment
             if spec:
                 self.rollouts = resources.enter_context(Rollouts(spec, self.schedule.workers))
@@ -289,10 +287,6 @@ class Trainer:
 
     def _evaluates_at(self, step: int) -> bool:
         return step % self.schedule.eval_every == 0 or step == self.schedule.steps
-
-    def _complete(self) -> bool:
-        evaluated = all(self.schedule.steps in e for e in self.evaluations) or not self.members[0].data.env_spec
-        return self.stack.step >= self.schedule.steps and evaluated
 
     def _resume(self) -> None:
         """Load the newest step that all runs have a whole checkpoint of; forget what came after it."""

@@ -70,6 +70,38 @@ def test_a_run_alone_equals_the_same_run_in_a_stack(medium: str) -> None:
             torch.testing.assert_close(ours[name], theirs[name], atol=1e-4, rtol=0)
 
 
+def test_new_seeds_leave_finished_ones_alone(medium: str) -> None:
+    """Seed 0 is done, seed 1 is half way, seed 2 is new: each goes on from where it is, to its own bits."""
+    whole = train("td3_bc", medium, "whole", 200, seeds=[0, 1, 2])
+    (first,) = train("td3_bc", medium, "runs", 200, seeds=0)
+    train("td3_bc", medium, "runs", 100, seeds=1)
+    before = first.policy_path.stat().st_mtime_ns
+    for a, b in zip(whole, train("td3_bc", medium, "runs", 200, seeds=[0, 1, 2]), strict=True):
+        ours, theirs = (load_file(run.folder / "checkpoint-000000200.safetensors") for run in (a, b))
+        for name in ours:
+            torch.testing.assert_close(ours[name], theirs[name], atol=1e-4, rtol=0)
+        assert b.evaluations().keys() == {100, 200}
+    assert first.policy_path.stat().st_mtime_ns == before
+
+
+def test_fewer_steps_than_there_are_do_not_undo_a_run(medium: str) -> None:
+    (run,) = train("td3_bc", medium, "runs", 400)
+    assert checkpoints.steps(run.folder) == [400, 300]
+    with pytest.raises(OffbenchError, match="is at step 400 already; give --steps 400"):
+        train("td3_bc", medium, "runs", 200)
+    assert run.evaluations().keys() == {100, 200, 300, 400}
+
+
+def test_a_stack_killed_between_two_checkpoints_goes_on_from_the_older(medium: str) -> None:
+    whole = train("bdb", medium, "whole", 300, seeds=[0, 1])
+    first, second = train("bdb", medium, "runs", 200, seeds=[0, 1])
+    (second.folder / "checkpoint-000000200.safetensors").unlink()
+    for a, b in zip(whole, train("bdb", medium, "runs", 300, seeds=[0, 1]), strict=True):
+        assert a.policy_path.read_bytes() == b.policy_path.read_bytes()
+        assert a.evaluations_path.read_bytes() == b.evaluations_path.read_bytes()
+    assert first.config()["seed"] == 0
+
+
 def test_a_finished_run_is_left_alone(medium: str) -> None:
     (run,) = train("td3_bc", medium, "runs", 100)
     before = {path.name: path.stat().st_mtime_ns for path in run.folder.glob("*.safetensors")}
