@@ -12,6 +12,7 @@ import numpy as np
 
 from offbench.errors import OffbenchError
 from offbench.files import write_json
+from offbench.ladder import shipped_references
 from offbench.policy import Policy, load_policy
 from offbench.recipes import d4rl_constants, env_spec, load_recipe
 from offbench.rollout import Rollouts, make_env, result
@@ -44,7 +45,7 @@ class Evaluation:
             f"return {mean:.1f} (95% interval {low:.1f} to {high:.1f}), std {np.std(self.returns):.1f}, "
             f"length {np.mean(self.lengths):.0f}",
         ]
-        names = {"dataset": "the dataset's own reference", "d4rl": "D4RL's constants"}
+        names = {"dataset": "own reference: random and expert of this environment", "d4rl": "D4RL's constants"}
         return lines + [f"normalized score {score:.1f} ({names[key]})" for key, score in self.scores.items()]
 
 
@@ -90,7 +91,10 @@ def evaluate(
         future = rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 2), episodes, not stochastic)
         outcomes = result(future)
     returns = [outcome.ret for outcome in outcomes]
-    known = config.get("references") or {"d4rl": d4rl_constants(policy.env_id)}
+    known = config.get("references") or {
+        "dataset": shipped_references(policy.env_id),
+        "d4rl": d4rl_constants(policy.env_id),
+    }
     scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in known.items() if pair}
     return Evaluation(str(path), policy.env_id, returns, [o.length for o in outcomes], scores)
 

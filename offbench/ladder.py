@@ -26,6 +26,7 @@ import numpy as np
 from offbench.errors import OffbenchError
 from offbench.files import csv_bytes, disk_errors, read_json, write_bytes, write_json
 from offbench.policy import Policy, load_policy, uniform
+from offbench.recipes import load_recipe, names
 from offbench.rollout import Outcome, Rollouts, make_env
 from offbench.scores import interval, normalize
 from offbench.seeds import Purpose
@@ -107,6 +108,15 @@ def read_ladder(folder: Path) -> Ladder | None:
     except (OSError, KeyError, ValueError, TypeError, StopIteration) as error:
         raise OffbenchError(f"the ladder in {folder} is damaged ({error!r}); train it anew with --retrain") from None
     return ladder
+
+
+def shipped_references(env_id: str) -> tuple[float, float] | None:
+    """Return the (random, expert) returns shipped for an environment id; None if there is no ladder of it."""
+    for name in names():
+        recipe = load_recipe(name)
+        if recipe.env_id == env_id and recipe.folder and (ladder := read_ladder(recipe.folder / "behaviour")):
+            return ladder.random_return, ladder.expert_return
+    return None
 
 
 def _rung(row: dict[str, str]) -> Rung:
