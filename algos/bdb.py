@@ -173,7 +173,6 @@ class BDB:
         )
         # one number a run, beta = its sigmoid; it starts at 0.5 and stands still unless beta is learned
         self.learned_beta = Learned(torch.zeros(1, len(run_seeds), 1, device=device), c.beta_learning_rate)
-        self.learns_beta = bool((c.beta == LEARNED).any())
         self.actor_target, self.critic_target = Target(self.actor), Target(self.critic)
         self.learned = {
             "actor": self.actor,
@@ -212,8 +211,7 @@ class BDB:
             warm_up = kind == "critic+cloning actor"
             loss, more = actor_loss(self.actor, self.critic, self.discriminator, self.learned_beta, batch, c, warm_up)
             self.actor.minimize(loss.sum())
-            if self.learns_beta and not warm_up:
-                self.learned_beta.minimize(learned_beta_loss(self.learned_beta, more["bc"], c).sum())
+            self.learned_beta.minimize(learned_beta_loss(self.learned_beta, more["bc"], c, warm_up).sum())
             self.actor_target.follow(c.tau)
             self.critic_target.follow(c.tau)
             logs |= more
@@ -227,13 +225,14 @@ class BDB:
 # Ours, beyond the paper; all of it off by default.
 
 
-def learned_beta_loss(learned_beta: Learned, cloning: Tensor, c: Any) -> Tensor:
-    """Return the loss [runs] of a learned beta = sigmoid(b): beta (cloning error - target).
+def learned_beta_loss(learned_beta: Learned, cloning: Tensor, c: Any, warm_up: bool) -> Tensor:
+    """Return the loss [runs] of a learned beta = sigmoid(b): beta (cloning error - target); 0 if it is not learned.
 
     1 - beta is the multiplier of the constraint "cloning error <= beta_target": an error above the target lowers
     beta, so cloning holds tighter; one below it raises beta, and the discriminator takes over.
     """
-    error: Tensor = cloning - c.beta_target
+    at_work = (c.beta == LEARNED) & (not warm_up)
+    error = torch.where(at_work, cloning - c.beta_target, torch.zeros_like(cloning))
     return learned_beta.flat[0, :, 0].sigmoid() * error
 
 

@@ -11,7 +11,8 @@ critics are pushed down where the policy or chance would act, and up on the data
                  lagrange: multiplier (penalty - target_action_gap), the multiplier trained to raise it
     temperature  loss = -log(temperature) mean [ log pi(a|s) + target entropy ],  target entropy = -dim(A)
 
-Deviations: the actor sees the critics after their update, as in SB3 (the authors compute its loss just before);
+Deviations: the actor sees the critics after their update, as in SB3 (the authors compute its loss just before), and
+the temperature before its own (theirs is updated first); initial weights are torch.nn.Linear's (rlkit has its own);
 the actor has the critics' three hidden layers, as in their code (Table 5 gives its width alone).
 """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from offbench.errors import OffbenchError
-from offbench.ladder import Ladder, build_ladder
+from offbench.ladder import Ladder, build_ladder, check_place
 from offbench.recipes import Recipe, load_recipe
 from offbench.sac import Training, train
 from offbench.workers import default_workers
@@ -45,8 +45,7 @@ def behaviour(
     if steps < segment or steps % segment:
         raise OffbenchError(f"steps must be a multiple of {segment} (the recipe's segment), not {steps}")
     training = Training(recipe, seed, folder_of(recipe, seed, Path(behaviour_dir)))
+    place = check_place(Path(out) if out else training.folder / "ladder")
     train(training, steps)
     command = f"offbench behaviour {recipe.name} --seed {seed} --steps {steps}"
-    return build_ladder(
-        training, steps, Path(out) if out else training.folder / "ladder", default_workers(workers), command
-    )
+    return build_ladder(training, steps, place, default_workers(workers), command)

@@ -6,7 +6,7 @@
         draws               the random numbers of one update, by name
         kind(step)          which sort of update comes at a step
         update(batch, noise, kind) -> {name: [runs]}
-        learned             {name: Network}: all that a checkpoint keeps
+        learned             {name: Network, Target or Learned}: all that a checkpoint keeps
         policy(run)         the policy file's kind and layers
 
 Every tensor has the run axis first; runs of a stack share shapes and every setting that is not `per_run`.
@@ -53,6 +53,7 @@ class PolicyParts(NamedTuple):
     """A policy file's kind (see offbench/policy.py) and weights, each layer (weight [in, out], bias [out]).
 
     Attributes:
+        activation: between the layers, `relu` or `tanh`.
         critic, samples: for the kind `best_by_q` alone: Q of (observation, action), and how many to choose from.
     """
 
@@ -60,6 +61,7 @@ class PolicyParts(NamedTuple):
     layers: list[tuple[Tensor, Tensor]]
     critic: list[tuple[Tensor, Tensor]] = []  # noqa: RUF012 (never changed)
     samples: int = 1
+    activation: str = "relu"
 
 
 class Keeps(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from offbench.environments import checked_spec, env_spec, same_environment
 from offbench.errors import OffbenchError
 from offbench.files import write_json
 from offbench.ladder import shipped_references
 from offbench.policy import Policy, load_policy
-from offbench.recipes import d4rl_constants, env_spec, load_recipe
-from offbench.rollout import Rollouts, make_env, result
+from offbench.recipes import d4rl_constants, load_recipe
+from offbench.rollout import Rollouts, result
 from offbench.runs import Run
 from offbench.scores import interval, normalize
 from offbench.seeds import Purpose, generator
@@ -82,21 +84,20 @@ def evaluate(
         policy = load_policy(run.policy_path)
     else:
         policy = load_policy(path)
-    spec = _spec(policy, config, env)
-    _check_fits(policy, spec, path)
+    spec = _spec(path, policy, config, env)
     if stochastic and not policy.stochastic:
-        raise OffbenchError(f"{path} is a deterministic policy; leave out --stochastic")
+        raise OffbenchError(f"{path} cannot sample its actions; leave out --stochastic")
     workers = default_workers(workers)
     with Rollouts(spec, workers if workers > 1 else 0) as rollouts:
         future = rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 2), episodes, not stochastic)
         outcomes = result(future)
     returns = [outcome.ret for outcome in outcomes]
-    known = config.get("references") or {
-        "dataset": shipped_references(policy.env_id),
-        "d4rl": d4rl_constants(policy.env_id),
-    }
+    played = json.loads(spec)["id"]
+    # a run's own references hold for its own environment alone
+    known = config.get("references") if same_environment(config.get("env_spec"), spec) else None
+    known = known or {"dataset": shipped_references(played), "d4rl": d4rl_constants(played)}
     scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in known.items() if pair}
-    return Evaluation(str(path), policy.env_id, returns, [o.length for o in outcomes], scores)
+    return Evaluation(str(path), played, returns, [o.length for o in outcomes], scores)
 
 
 def similarity(
@@ -133,12 +134,14 @@ def similarity(
         raise OffbenchError(f"{path}: {run.config()['algorithm']} has no critic to compare by")
     rng = generator(seed, Purpose.SAMPLE)
     batch = stack.store.batch(torch.from_numpy(rng.integers(stack.store.sizes[0], size=(1, samples))))
+    policy = stack.policy(0)
+    dim, act = len(policy.observation_mean), len(policy.low)
     policy = dataclasses.replace(  # acts on normalised observations, in [-1, 1], as the critic sees them
-        stack.policy(0),
-        observation_mean=np.zeros_like(stack.policy(0).observation_mean),
-        observation_std=np.ones_like(stack.policy(0).observation_std),
-        low=-np.ones_like(stack.policy(0).low),
-        high=np.ones_like(stack.policy(0).high),
+        policy,
+        observation_mean=np.zeros(dim, np.float32),
+        observation_std=np.ones(dim, np.float32),
+        low=-np.ones(act, np.float32),
+        high=np.ones(act, np.float32),
     )
     noise = policy.draw(rng, samples) if policy.needs_noise(deterministic=True) else None
     pi = torch.from_numpy(policy.act(batch.observations[0].numpy(), noise)).unsqueeze(0)
@@ -156,23 +159,14 @@ def similarity(
     return found
 
 
-def _spec(policy: Policy, config: Mapping[str, Any], env: str | None) -> str:
+def _spec(path: Path, policy: Policy, config: Mapping[str, Any], env: str | None) -> str:
+    """Return the environment to play in, checked to fit the policy."""
     if env is not None:
-        return load_recipe(env).env_spec()
-    known = config.get("env_spec")
-    if isinstance(known, str):
-        return known
-    if not policy.env_id:
-        raise OffbenchError("the policy names no environment; give one with --env")
-    return env_spec(policy.env_id)
-
-
-def _check_fits(policy: Policy, spec: str, path: Path) -> None:
-    env = make_env(spec)
-    shapes = (env.observation_space.shape, env.action_space.shape)
-    env.close()
-    if shapes != (policy.observation_mean.shape, policy.low.shape):
-        raise OffbenchError(
-            f"{path} takes observations {policy.observation_mean.shape} and gives actions {policy.low.shape}; "
-            f"the environment has {shapes[0]} and {shapes[1]}: give the right one with --env"
-        )
+        text = load_recipe(env).env_spec()
+    elif isinstance(config.get("env_spec"), str):
+        text = config["env_spec"]
+    elif policy.env_id:
+        text = env_spec(policy.env_id)
+    else:
+        raise OffbenchError(f"{path} names no environment; give one with --env")
+    return checked_spec(text, str(path), len(policy.observation_mean), len(policy.low))

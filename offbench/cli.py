@@ -131,7 +131,8 @@ def _train(parser: Parser, words: list[str]) -> None:
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
     parser.add_argument("--workers", type=whole, help="evaluation processes (default: all cores but one)")
     parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
-    algorithm = next((word for word in words if not word.startswith("-")), None)
+    positions = [word for before, word in zip(["", *words], words, strict=False) if not before.startswith("--")]
+    algorithm = next((word for word in positions if not word.startswith("-")), None)
     if algorithm is None:
         parser.epilog = "`offbench train ALGO --help` shows the algorithm's own settings."
         return

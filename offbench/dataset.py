@@ -118,6 +118,7 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
         except Timeout:
             raise OffbenchError(f"{dataset_id} is being recorded by another process; wait for it") from None
     try:
+        _recover(path)
         if path.exists() and not overwrite:
             raise OffbenchError(f"{dataset_id} exists already; use --overwrite to replace it, or --id for another id")
         yield path
@@ -135,11 +136,9 @@ def write(path: Path, episodes: Iterable[Episode], spec: str, metadata: dict[str
         steps: transitions to come, to see beforehand whether the disk has room.
     """
     env_spec = EnvSpec.from_json(spec)
-    aside = path.with_name(f".offbench-{path.name}.partial")
-    old = path.with_name(f".offbench-{path.name}.old")
+    aside, old = path.with_name(f".offbench-{path.name}.partial"), _old(path)
     with disk_errors(str(path)):
-        for stale in (aside, old):  # left by a process that was killed; the lock says none is at work
-            shutil.rmtree(stale, ignore_errors=True)
+        shutil.rmtree(aside, ignore_errors=True)  # left by a process that was killed; the lock says none is at work
         (aside / "data").mkdir(parents=True)
         try:
             with warnings.catch_warnings():
@@ -154,9 +153,22 @@ def write(path: Path, episodes: Iterable[Episode], spec: str, metadata: dict[str
                 path.replace(old)
             aside.replace(path)
         finally:
+            _recover(path)
             shutil.rmtree(aside, ignore_errors=True)
-            shutil.rmtree(old, ignore_errors=True)
     return content.hexdigest()
+
+
+def _old(path: Path) -> Path:
+    """Return where the dataset that is being replaced waits for a moment."""
+    return path.with_name(f".offbench-{path.name}.old")
+
+
+def _recover(path: Path) -> None:
+    """Put the replaced dataset back if the new one did not make it, else delete it."""
+    old = _old(path)
+    if old.exists() and not path.exists():
+        old.replace(path)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def _buffers(episodes: Iterable[Episode], dtype: Any, content: ContentHash) -> Iterator[EpisodeBuffer]:

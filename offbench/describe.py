@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,8 +35,13 @@ def inventory() -> dict[str, Any]:
         }
     datasets = {}
     for dataset_id in dataset.local_ids():
-        metadata = dataset.read_metadata(dataset_id)
-        datasets[dataset_id] = {key: metadata.get(key) for key in ("total_steps", "total_episodes", "algorithm_name")}
+        try:
+            metadata = dataset.read_metadata(dataset_id)
+            counts = {key: int(metadata[key]) for key in ("total_steps", "total_episodes")}
+        except (OffbenchError, KeyError, TypeError, ValueError):
+            print(f"offbench: warning: {dataset_id} has damaged metadata", file=sys.stderr)
+            continue
+        datasets[dataset_id] = counts | {"algorithm_name": metadata.get("algorithm_name")}
     return {
         "environments": environments,
         "levels": list(LEVELS),
@@ -105,7 +111,7 @@ class Summary:
         """Draw the histogram of returns. Raises OffbenchError if the picture cannot be written."""
         from offbench.plots import figure, save
 
-        with figure() as (fig, axes):
+        with figure() as (fig, (axes,)):
             axes.hist(self.returns, bins=40, color="#3b6ea5")
             axes.axvline(self.returns.mean(), color="#c44", linewidth=1.2, label=f"mean {self.returns.mean():.0f}")
             axes.set(xlabel="return", ylabel="episodes", title=self.dataset_id)

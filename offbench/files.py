@@ -24,7 +24,7 @@ def disk_errors(what: str) -> Iterator[None]:
         if isinstance(error, FileNotFoundError | BrokenPipeError):
             raise
         reason = error.strerror or str(error)
-        raise OffbenchError(f"cannot write {what}: {reason}; nothing there was changed") from error
+        raise OffbenchError(f"cannot write {what}: {reason}; free some room or choose another folder") from error
 
 
 def write_bytes(path: Path, data: bytes) -> None:

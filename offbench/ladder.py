@@ -14,6 +14,7 @@ luck does not flatter it.
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 import sys
 from collections.abc import Iterable, Iterator
@@ -23,12 +24,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from offbench.environments import make_env
 from offbench.errors import OffbenchError
 from offbench.files import csv_bytes, disk_errors, read_json, write_bytes, write_json
 from offbench.policy import Policy, load_policy, uniform
-from offbench.recipes import load_recipe, names
-from offbench.rollout import Outcome, Rollouts, make_env
-from offbench.scores import interval, normalize
+from offbench.recipes import Recipe, load_recipe, names
+from offbench.rollout import MEASURES, Outcome, Rollouts, result, summary
+from offbench.scores import normalize
 from offbench.seeds import Purpose
 
 if TYPE_CHECKING:
@@ -37,7 +39,6 @@ if TYPE_CHECKING:
 MEDIUM = 1 / 3  # of the expert's normalised return
 MEDIUM_AT_MOST = 0.45  # a rung beyond this is no medium while there is another
 CANDIDATES = 8  # late rungs that are measured to find the expert
-MEASURES = ("return", "low", "high", "length")
 COLUMNS = ("step", "hours", "role", "policy", *MEASURES, *(f"deterministic_{m}" for m in MEASURES), "episodes")
 
 
@@ -88,6 +89,16 @@ class Ladder:
         """Read a rung's policy."""
         return load_policy(self.folder / "policies" / rung.policy)
 
+    def check(self, recipe: Recipe) -> Ladder:
+        """Return itself; raise OffbenchError if it is of another environment than the recipe."""
+        kwargs = json.loads(json.dumps(dict(recipe.env_kwargs)))
+        if (self.info.get("env_id"), self.info.get("env_kwargs")) != (recipe.env_id, kwargs):
+            raise OffbenchError(
+                f"the ladder in {self.folder} is of {self.info.get('env_id')} {self.info.get('env_kwargs')}, "
+                f"the recipe is of {recipe.env_id} {kwargs}; delete that folder, or rename the recipe"
+            )
+        return self
+
     @property
     def replay(self) -> Path:
         """The transitions of medium-replay."""
@@ -95,7 +106,7 @@ class Ladder:
 
 
 def read_ladder(folder: Path) -> Ladder | None:
-    """Read a ladder's folder, or return None if there is no whole one. Raises OffbenchError if it is damaged."""
+    """Read a ladder's folder, or return None if there is none. Raises OffbenchError if it is damaged."""
     if not (folder / "ladder.json").exists():
         return None
     info = read_json(folder / "ladder.json")
@@ -103,10 +114,13 @@ def read_ladder(folder: Path) -> Ladder | None:
         with open(folder / "ladder.csv", newline="", encoding="utf-8") as file:
             rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
         ladder = Ladder(folder, info, rungs)
-        if not (np.isfinite([ladder.random_return, ladder.expert_return]).all() and ladder.role("medium")):
+        known = [ladder.random_return, ladder.expert_return, int(info["medium_replay"]["transitions"])]
+        if not (np.isfinite(known).all() and ladder.role("medium") and ladder.role("expert")):
             raise ValueError("its references are not numbers")
-    except (OSError, KeyError, ValueError, TypeError, StopIteration) as error:
-        raise OffbenchError(f"the ladder in {folder} is damaged ({error!r}); train it anew with --retrain") from None
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, StopIteration) as error:
+        raise OffbenchError(
+            f"the ladder in {folder} is damaged ({error!r}); delete it and build it again with `offbench behaviour`"
+        ) from None
     return ladder
 
 
@@ -149,7 +163,10 @@ class Surveyor:
 
     def run(self, policy: Policy, stream: tuple[int, ...], count: int, deterministic: bool = False) -> list[Outcome]:
         """Play evaluation episodes."""
-        return self.rollouts.outcomes(policy, self.training.seed, stream, count, deterministic).result()
+        outcomes: list[Outcome] = result(
+            self.rollouts.outcomes(policy, self.training.seed, stream, count, deterministic)
+        )
+        return outcomes
 
     def expert(self) -> int:
         """Return the best rung of the second half by measured return."""
@@ -179,12 +196,18 @@ class Surveyor:
         return step
 
 
-def summary(outcomes: list[Outcome], prefix: str = "") -> dict[str, float]:
-    """Return mean return, its 95% interval and mean length."""
-    mean, low, high = interval([o.ret for o in outcomes])
-    length = float(np.mean([o.length for o in outcomes]))
-    values = {"return": mean, "low": low, "high": high, "length": length}
-    return {prefix + key: round(value, 4) for key, value in values.items()}
+def check_place(out: Path) -> Path:
+    """Return the folder where a ladder may be written, absolute.
+
+    Raises:
+        OffbenchError: it holds something else, which a new ladder would replace.
+    """
+    out = out.resolve()
+    if out.exists() and not out.is_dir():
+        raise OffbenchError(f"{out} is a file; a ladder needs a folder of its own")
+    if out.exists() and any(out.iterdir()) and not (out / "ladder.json").exists():
+        raise OffbenchError(f"{out} holds other files, which a ladder would replace; give an empty or new folder")
+    return out
 
 
 def build_ladder(training: Training, steps: int, out: Path, workers: int, command: str) -> Ladder:
@@ -262,8 +285,12 @@ def _write(
             aside / "medium-replay.hdf5", replay_episodes(training, info["levels"]["medium"])
         )
         write_json(aside / "ladder.json", info)
-        shutil.rmtree(out, ignore_errors=True)
+        old = out.with_name(f".{out.name}.old")
+        shutil.rmtree(old, ignore_errors=True)
+        if out.exists():
+            out.replace(old)
         aside.replace(out)
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def _table(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import operator
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,15 +13,16 @@ from typing import Any
 import torch
 
 from offbench import checkpoints, transitions
-from offbench.errors import OffbenchError
+from offbench.environments import checked_spec, same_environment
+from offbench.errors import OffbenchError, unknown
 from offbench.provenance import hardware, versions, warn_other_physics
 from offbench.recipes import d4rl_constants
 from offbench.registry import load_algorithm
-from offbench.runs import Run, run_folder, settings_dict, variant
+from offbench.runs import FORMAT, Run, run_folder, settings_dict, variant
 from offbench.settings import build, check, fields
 from offbench.training import Member, Schedule, Stack, Trainer
 from offbench.transitions import Transitions
-from offbench.workers import cores
+from offbench.workers import cores, default_workers
 
 
 def train(
@@ -59,12 +61,15 @@ def train(
         OffbenchError: anything that the user can mend, said in one line.
     """
     kind = load_algorithm(algorithm)
-    configs = [kind.Config(**values) for values in _grid(kind.Config, settings, algorithm)]
-    seed_list = [seeds] if isinstance(seeds, int) else list(seeds)
-    _check_numbers(seed_list, steps, eval_every, eval_episodes, workers)
+    configs = list(dict.fromkeys(kind.Config(**values) for values in _grid(kind.Config, settings, algorithm)))
+    seed_list = _seed_list(seeds)
+    _check_numbers(seed_list, steps, eval_every, eval_episodes)
     place = pick_device(device)
-    datasets = [transitions.load(name) for name in ([dataset] if isinstance(dataset, str) else dataset)]
-    schedule = Schedule(steps, eval_every, eval_episodes, place, workers or max(1, cores() - 1))
+    datasets = [transitions.load(name) for name in ([dataset] if isinstance(dataset, str) else dict.fromkeys(dataset))]
+    _check_environment(datasets)
+    schedule = Schedule(
+        steps, eval_every, eval_episodes, place, max(1, cores() - 1) if workers is None else default_workers(workers)
+    )
     members = []
     for data, config, seed in itertools.product(datasets, configs, seed_list):
         warn_other_physics(data.dataset_id, data.metadata.get("offbench", {}).get("versions", {}))
@@ -88,14 +93,17 @@ def together(members: Sequence[Member], steps: int) -> list[list[Member]]:
         OffbenchError: a run is further than `steps` already.
     """
     known = {member.run.folder: set(checkpoints.steps(member.run.folder)) for member in members}
-    for folder, found in known.items():
-        if found and min(found) > steps:
+    left, groups = [], []
+    for member in members:
+        found = known[member.run.folder]
+        evaluated = not member.data.env_spec or steps in member.run.evaluations()
+        if steps in found and evaluated:
+            continue  # finished: left alone
+        if found and max(found) > steps:
             raise OffbenchError(
-                f"{folder} is at step {max(found)} already; give --steps {max(found)} or more, or --runs"
+                f"{member.run.folder} is at step {max(found)} already; give --steps {max(found)} or more, or --runs"
             )
-    # a run that is finished and evaluated is left alone
-    left = [m for m in members if steps not in known[m.run.folder] or (m.data.env_spec and not _evaluated(m, steps))]
-    groups = []
+        left.append(member)
     while left:
         counts = Counter(step for member in left for step in known[member.run.folder] if step <= steps)
         # the step that most runs share; among those the newest
@@ -106,14 +114,37 @@ def together(members: Sequence[Member], steps: int) -> list[list[Member]]:
     return groups
 
 
-def _evaluated(member: Member, step: int) -> bool:
-    return step in member.run.evaluations()
+def _seed_list(seeds: int | Sequence[int]) -> list[int]:
+    try:
+        return [operator.index(seed) for seed in ([seeds] if isinstance(seeds, int) else seeds)]
+    except TypeError:
+        raise OffbenchError(f"seeds must be whole numbers, not {seeds!r}") from None
+
+
+def _check_environment(datasets: Sequence[Transitions]) -> None:
+    """Refuse datasets of different environments, and one whose environment cannot be played."""
+    if not datasets:
+        raise OffbenchError("give at least one dataset")
+    first = datasets[0]
+    for data in datasets[1:]:
+        if (
+            data.observations.shape[1:] != first.observations.shape[1:]
+            or data.actions.shape[1:] != first.actions.shape[1:]
+        ):
+            raise OffbenchError(
+                f"datasets of one stack must have the same shapes: {first.dataset_id}, {data.dataset_id}"
+            )
+        if not same_environment(data.env_spec, first.env_spec):
+            raise OffbenchError(
+                f"datasets of one stack must be of one environment; {first.dataset_id} and {data.dataset_id} are not: "
+                "train them apart"
+            )
+    if first.env_spec:
+        checked_spec(first.env_spec, first.dataset_id, first.observations.shape[1], first.actions.shape[1])
 
 
 def _grid(cls: type, settings: Mapping[str, Any], algorithm: str) -> Iterator[dict[str, Any]]:
     """Yield the settings of each config: the product of all lists given."""
-    from offbench.errors import unknown
-
     known, columns = fields(cls), []
     for name, value in settings.items():
         if name not in known:
@@ -127,16 +158,10 @@ def _grid(cls: type, settings: Mapping[str, Any], algorithm: str) -> Iterator[di
         yield dict(row)
 
 
-def _check_numbers(seeds: Sequence[int], steps: int, eval_every: int, eval_episodes: int, workers: int | None) -> None:
-    if not seeds or any(not isinstance(seed, int) or seed < 0 for seed in seeds) or len(set(seeds)) < len(seeds):
+def _check_numbers(seeds: Sequence[int], steps: int, eval_every: int, eval_episodes: int) -> None:
+    if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
         raise OffbenchError(f"seeds must be different whole numbers from 0, not {list(seeds)}")
-    given = {
-        "steps": steps,
-        "eval_every": eval_every,
-        "eval_episodes": eval_episodes,
-        "workers": workers or 1,
-    }
-    for name, value in given.items():
+    for name, value in {"steps": steps, "eval_every": eval_every, "eval_episodes": eval_episodes}.items():
         if not isinstance(value, int) or value < 1:
             raise OffbenchError(f"{name} must be a whole number from 1, not {value}")
 
@@ -195,7 +220,7 @@ def _config(algorithm: str, member: Member, schedule: Schedule, command: str) ->
     data = member.data
     constants = d4rl_constants(data.env_id)
     return {
-        "format": "offbench-run-1",
+        "format": FORMAT,
         "algorithm": algorithm,
         "variant": variant(member.config),
         "settings": settings_dict(member.config),

@@ -12,22 +12,24 @@ import numpy as np
 
 from offbench.errors import OffbenchError
 from offbench.files import write_bytes
-from offbench.runs import find_runs
+from offbench.runs import Run
 from offbench.scores import normalize
+from offbench.tables import evaluated_groups
 
 FORMATS = ("png", "svg", "pdf")
 
 
 @contextlib.contextmanager
-def figure(width: float = 6.4, height: float = 4.0) -> Iterator[tuple[Any, Any]]:
-    """Yield (figure, axes), closed afterwards."""
+def figure(panels: int = 1) -> Iterator[tuple[Any, list[Any]]]:
+    """Yield (figure, axes of each panel side by side)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    fig = Figure(figsize=(width, height), layout="constrained")
+    fig = Figure(figsize=(6.4 * panels, 4.0), layout="constrained")
     FigureCanvasAgg(fig)
-    axes = fig.add_subplot()
-    axes.spines[["top", "right"]].set_visible(False)
+    axes = [fig.add_subplot(1, panels, i + 1) for i in range(panels)]
+    for panel in axes:
+        panel.spines[["top", "right"]].set_visible(False)
     yield fig, axes
 
 
@@ -44,23 +46,29 @@ def save(fig: Any, path: str | Path) -> Path:
 
 
 def plot_curves(runs: str | Path, path: str | Path) -> Path:
-    """Draw the normalised score of every variant below a folder against updates: mean and range over seeds.
+    """Draw the score of every variant below a folder against updates: mean and range over seeds, a panel a dataset.
 
-    Runs without a reference are drawn by their return.
+    Raises:
+        OffbenchError: there are no evaluated runs, or the picture cannot be written.
     """
-    groups: dict[str, list[dict[int, float]]] = {}
-    for run in find_runs(Path(runs)):
-        config, evaluations = run.config(), run.evaluations()
-        pair = (config.get("references") or {}).get("dataset")
-        name = f"{config['algorithm']} {config['variant']}".removesuffix(" default")
-        means = {step: float(np.mean([value for value, _ in rows])) for step, rows in evaluations.items()}
-        groups.setdefault(name, []).append({s: normalize(m, *pair) if pair else m for s, m in means.items()})
-    with figure() as (fig, axes):
-        for name, curves in sorted(groups.items()):
+    groups = evaluated_groups(runs)
+    datasets = list(dict.fromkeys(key[0] for key in groups))
+    with figure(len(datasets)) as (fig, panels):
+        for (dataset_id, algorithm, variant, _), group in groups.items():
+            axes = panels[datasets.index(dataset_id)]
+            pair = group[0][1]["references"]["dataset"]
+            curves = [_curve(run, pair) for run, _ in group]
             steps = sorted(set.intersection(*(set(curve) for curve in curves)))
             values = np.array([[curve[step] for step in steps] for curve in curves])
+            name = f"{algorithm} {variant}".removesuffix(" default")
             (line,) = axes.plot(steps, values.mean(0), marker="o", markersize=3, label=name)
             axes.fill_between(steps, values.min(0), values.max(0), color=line.get_color(), alpha=0.15, linewidth=0)
-        axes.set(xlabel="updates", ylabel="normalized score")
-        axes.legend(frameon=False)
+            axes.set(title=dataset_id, xlabel="updates", ylabel="normalized score" if pair else "return")
+        for axes in panels:
+            axes.legend(frameon=False, fontsize="small")
         return save(fig, path)
+
+
+def _curve(run: Run, pair: tuple[float, float] | None) -> dict[int, float]:
+    means = {step: float(np.mean([value for value, _ in rows])) for step, rows in run.evaluations().items()}
+    return {step: normalize(mean, *pair) if pair else mean for step, mean in means.items()}

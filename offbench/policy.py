@@ -1,6 +1,6 @@
 """The policy file: one safetensors file that says everything needed to act, and a NumPy forward that acts.
 
-    W0 [obs, h]  b0 [h]  W1 [h, h]  b1 [h]  W2 [h, out]  b2 [out]        (x @ W + b, relu between)
+    W0 [obs, h]  b0 [h]  W1 [h, h]  b1 [h]  W2 [h, out]  b2 [out]        (x @ W + b, activation between)
     kind "tanh"               out = act          action = tanh(out)
     kind "squashed_gaussian"  out = 2 x act      action = tanh(mean + std * noise), log std clipped to [-20, 2]
     kind "best_by_q"          the squashed Gaussian's best of `samples` actions by Q(observation, action in [-1, 1])
@@ -17,6 +17,7 @@ import dataclasses
 import functools
 import json
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,10 @@ from offbench.files import write_bytes
 Array = npt.NDArray[Any]
 KINDS = ("tanh", "squashed_gaussian", "best_by_q", "uniform")
 Layers = tuple[tuple[Array, Array], ...]
+ACTIVATIONS: dict[str, Callable[[Array], Any]] = {  # in place
+    "relu": lambda x: np.maximum(x, 0.0, out=x),
+    "tanh": lambda x: np.tanh(x, out=x),
+}
 NETWORKS = ("layers", "critic")
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # Stable-Baselines3's bounds, and CQL's
 
@@ -47,6 +52,7 @@ class Policy:
         low, high: [act], the bounds of the environment's action space.
         env_id: the environment it was trained for.
         origin: provenance, anything JSON: algorithm, training step, dataset, seed.
+        activation: between layers, a key of ACTIVATIONS.
         critic, samples: of the kind `best_by_q`: layers of Q, and how many actions it chooses from.
     """
 
@@ -60,6 +66,7 @@ class Policy:
     origin: dict[str, Any] = dataclasses.field(default_factory=dict)
     critic: Layers = ()
     samples: int = 1
+    activation: str = "relu"
 
     @functools.cached_property
     def _double(self) -> tuple[Layers, Layers, Array, Array]:
@@ -105,7 +112,7 @@ class Policy:
             return np.zeros((len(observations), len(self.low))) if noise is None else noise
         actor, critic, _, _ = self._double
         x = (np.asarray(observations, np.float64) - self.observation_mean) / self.observation_std
-        out = _forward(actor, x)
+        out = _forward(actor, x, self.activation)
         if self.kind == "tanh":
             return np.asarray(np.tanh(out))
         mean, log_std = np.split(out, 2, axis=-1)
@@ -114,7 +121,7 @@ class Policy:
             return np.asarray(np.tanh(mean if noise is None else mean + std * noise))
         actions = np.tanh(mean[:, None] + std[:, None] * noise)  # [n, samples, act]
         repeated = np.broadcast_to(x[:, None], (*actions.shape[:2], x.shape[1]))
-        best = _forward(critic, np.concatenate([repeated, actions], -1))[..., 0].argmax(1)
+        best = _forward(critic, np.concatenate([repeated, actions], -1), self.activation)[..., 0].argmax(1)
         chosen: Array = actions[np.arange(len(actions)), best]
         return chosen
 
@@ -131,6 +138,7 @@ class Policy:
             "env_id": self.env_id,
             "origin": self.origin,
             "samples": self.samples,
+            "activation": self.activation,
         }
         arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in tensors.items()}
         return bytes(save(arrays, metadata={"offbench": json.dumps(header, sort_keys=True)}))
@@ -140,12 +148,12 @@ class Policy:
         write_bytes(path, self.to_bytes())
 
 
-def _forward(layers: Layers, x: Array) -> Array:
-    """Return the last layer's output, relu between layers."""
+def _forward(layers: Layers, x: Array, activation: str) -> Array:
+    """Return the last layer's output."""
     for weight, bias in layers[:-1]:
         x = x @ weight
         x += bias
-        np.maximum(x, 0.0, out=x)
+        ACTIVATIONS[activation](x)
     weight, bias = layers[-1]
     out: Array = x @ weight + bias
     return out
@@ -171,7 +179,7 @@ def from_bytes(data: bytes) -> Policy:
     """Read a policy from a file's content. Raises ValueError saying what is wrong with it."""
     try:
         tensors = load(data)
-    except SafetensorError as error:
+    except (SafetensorError, KeyError, TypeError) as error:  # KeyError: a dtype that NumPy lacks
         raise ValueError(f"not safetensors ({error})") from None
     header = _header(data)
     kind = header.get("kind")
@@ -189,7 +197,10 @@ def from_bytes(data: bytes) -> Policy:
         tuple((tensors[f"{net}.{i}.weight"], tensors[f"{net}.{i}.bias"]) for i in range(n)) for net, n in sizes.items()
     )
     mean, std, low, high = (tensors[name] for name in ("observation_mean", "observation_std", "low", "high"))
-    policy = Policy(kind, layers, mean, std, low, high, env_id, origin, critic, samples)
+    activation = header.get("activation", "relu")
+    if activation not in ACTIVATIONS:
+        raise ValueError(f"unknown activation {activation!r}")
+    policy = Policy(kind, layers, mean, std, low, high, env_id, origin, critic, samples, activation)
     _check_shapes(policy)
     return policy
 

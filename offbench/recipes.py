@@ -16,9 +16,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
-
+from offbench.environments import env_spec
 from offbench.errors import OffbenchError, unknown
 from offbench.settings import build, setting
 
@@ -43,7 +41,7 @@ class SACSettings:
     def cycle(self) -> tuple[int, int]:
         """Return (vectorised steps, gradient steps) of one turn of the training loop, both whole numbers."""
         ratio = Fraction(self.gradient_steps * self.envs).limit_denominator(64)
-        return ratio.denominator, max(1, ratio.numerator)
+        return ratio.denominator, ratio.numerator
 
 
 @dataclass(frozen=True)
@@ -78,33 +76,6 @@ class Recipe:
         """Return a hash over everything the recipe says (not over its layout or comments)."""
         values = {k: v for k, v in dataclasses.asdict(self).items() if k != "folder"}
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
-
-
-def env_spec(env_id: str, **kwargs: Any) -> str:
-    """Return Gymnasium's EnvSpec of `env_id` as JSON, checked to have Box observations and actions."""
-    try:
-        env = gym.make(env_id, **kwargs)
-    except Exception as error:  # a third-party environment may raise anything here
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise OffbenchError(f"cannot make the environment {env_id!r}: {reason}") from error
-    try:
-        box(env.observation_space, f"{env_id}: observations")
-        actions = box(env.action_space, f"{env_id}: actions")
-        if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
-            raise OffbenchError(f"{env_id}: actions must be bounded, the action space is {actions}")
-        assert env.spec is not None
-        return env.spec.to_json()
-    finally:
-        env.close()
-
-
-def box(space: gym.Space[Any], what: str) -> gym.spaces.Box:
-    """Return `space` if it is a flat float Box, else raise an OffbenchError that begins with `what`."""
-    if not isinstance(space, gym.spaces.Box):
-        raise OffbenchError(f"{what} must be a Box space, not {space}; wrap the environment to make it one")
-    if len(space.shape) != 1 or not np.issubdtype(space.dtype, np.floating):
-        raise OffbenchError(f"{what} must be a flat Box of floats, not {space}; wrap it in FlattenObservation")
-    return space
 
 
 def shipped() -> Path:
@@ -168,6 +139,8 @@ def _check(recipe: Recipe, where: str) -> None:
     if (recipe.d4rl_min is None) != (recipe.d4rl_max is None):
         raise OffbenchError(f"{where}: give both d4rl_min and d4rl_max, or neither")
     sac = recipe.sac
+    if not sac.cycle()[1]:
+        raise OffbenchError(f"{where}: [sac] gradient_steps x envs must be at least 1/64")
     turn = sac.cycle()[0] * sac.envs
     if sac.segment % turn:
         raise OffbenchError(f"{where}: [sac] segment must be a multiple of {turn} (envs x the steps of a turn)")

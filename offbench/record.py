@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 
 from offbench import dataset
+from offbench.environments import make_env
 from offbench.errors import OffbenchError
 from offbench.files import sha256
-from offbench.ladder import Ladder, Rung, read_ladder
+from offbench.ladder import MEDIUM, MEDIUM_AT_MOST, Ladder, Rung, read_ladder
 from offbench.levels import Part, parse_level, parse_mix, shares
 from offbench.policy import Policy, uniform
 from offbench.progress import Progress, duration
 from offbench.provenance import versions, warn_other_physics
 from offbench.recipes import Recipe, load_recipe
 from offbench.replay import load_replay
-from offbench.rollout import Episode, Rollouts, make_env
+from offbench.rollout import Episode, Rollouts
 from offbench.workers import default_workers
 
 HOME = "https://github.com/offbench/offbench"
@@ -62,8 +63,8 @@ def collect(
     recipe = load_recipe(env)
     name, parts = parse_mix(mix) if mix is not None else parse_level(level)
     dataset_id = dataset.check_id(dataset_id or f"{recipe.name}-{name}-v{recipe.version}")
-    if steps is not None and steps < len(parts):
-        raise OffbenchError(f"steps must be at least {len(parts)}, not {steps}")
+    if steps is not None and steps < 1:
+        raise OffbenchError(f"steps must be at least 1, not {steps}")
     workers = default_workers(workers)
     with dataset.claimed(dataset_id, overwrite) as path:
         ladder = _ladder(recipe, Path(behaviour_dir), retrain, workers)
@@ -83,13 +84,16 @@ def _ladder(recipe: Recipe, behaviour_dir: Path, retrain: bool, workers: int) ->
     """Return the shipped ladder, else the one trained here, else train it now."""
     shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder and not retrain else None
     if shipped:
+        shipped.check(recipe)
         warn_other_physics(f"the behaviour agent of {recipe.name}", shipped.info.get("versions", {}))
         return shipped
     from offbench.agents import behaviour, folder_of  # imports PyTorch
 
     local = read_ladder(folder_of(recipe, 0, behaviour_dir) / "ladder")
     if local:
-        return local
+        print(f"offbench: using the behaviour agent trained here: {local.folder}", file=sys.stderr)
+        warn_other_physics(f"the behaviour agent of {recipe.name}", local.info.get("versions", {}))
+        return local.check(recipe)
     gradient, steps = recipe.sac.steps * recipe.sac.gradient_steps, recipe.sac.steps
     print(
         f"offbench: {recipe.name} has no behaviour agent yet; training SAC for {steps:,} steps first, "
@@ -106,6 +110,8 @@ def _counts(recipe: Recipe, ladder: Ladder, parts: tuple[Part, ...], steps: int 
         return [available]
     total = steps if steps is not None else round(recipe.dataset_steps * sum(part.weight for part in parts))
     counts = shares(parts, total)
+    if 0 in counts:
+        raise OffbenchError(f"{total} steps leave a part of the blend without a transition; use more --steps")
     for part, count in zip(parts, counts, strict=True):
         if part.source == "replay" and count > available:
             raise OffbenchError(
@@ -178,6 +184,7 @@ class _Recording:
             "interval": [rung.low, rung.high],
             "episodes": rung.episodes,
             "fraction": round(self.ladder.fraction(rung), 4),
+            "target": {"medium": [round(MEDIUM, 4), MEDIUM_AT_MOST], "expert": "best"}.get(part.source, part.source),
             "policy_sha256": sha256((self.ladder.folder / "policies" / rung.policy).read_bytes()),
         }
 

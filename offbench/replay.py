@@ -91,9 +91,13 @@ def load_replay(path: Path, expected_sha256: str, low: Array, high: Array, dtype
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise OffbenchError(f"cannot read {path}: {error.strerror}; train the ladder anew with --retrain") from None
+        raise OffbenchError(
+            f"cannot read {path}: {error.strerror}; build the ladder again with `offbench behaviour`"
+        ) from None
     if sha256(data) != expected_sha256:
-        raise OffbenchError(f"{path} is damaged (its SHA-256 differs from the ladder's); reinstall or --retrain")
+        raise OffbenchError(
+            f"{path} is damaged (its SHA-256 differs from the ladder's); reinstall, or build the ladder again"
+        )
     with h5py.File(io.BytesIO(data), "r") as file:
         arrays = {name: values[()] for name, values in file.items()}
     span = (high.astype(np.float64) - low) / 2

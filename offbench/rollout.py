@@ -15,8 +15,10 @@ import functools
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
+import types
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -26,11 +28,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec
 
 from offbench import seeds
+from offbench.environments import make_env
 from offbench.errors import OffbenchError
 from offbench.policy import Array, Policy, from_bytes
+from offbench.scores import interval
 from offbench.seeds import Purpose
 
 LANES = 8  # episodes that share a policy forward
@@ -95,6 +98,17 @@ class Outcome:
     length: int
 
 
+MEASURES = ("return", "low", "high", "length")
+
+
+def summary(outcomes: list[Outcome], prefix: str = "") -> dict[str, float]:
+    """Return mean return, its 95% interval and mean length."""
+    mean, low, high = interval([o.ret for o in outcomes])
+    length = float(np.mean([o.length for o in outcomes]))
+    values = {"return": mean, "low": low, "high": high, "length": length}
+    return {prefix + key: round(value, 4) for key, value in values.items()}
+
+
 class _Lane:
     """One environment in the middle of an episode."""
 
@@ -103,7 +117,7 @@ class _Lane:
         self.env, self.policy, self.slot = env, policy, slot
         self.seed = seeds.integer(task.seed, Purpose.RESET, *task.stream, index)
         self.rng = seeds.generator(task.seed, Purpose.ACTION, *task.stream, index)
-        self.observations = [env.reset(seed=self.seed)[0]]
+        self.observations = [np.array(env.reset(seed=self.seed)[0])]  # a copy: environments may reuse their array
         self.actions: list[Array] = []
         self.rewards: list[float] = []
         self.noise: Array = np.empty((0, 0))
@@ -118,7 +132,7 @@ class _Lane:
     def step(self, action: Array) -> Episode | None:
         """Take one step; return the whole episode if it was the last one."""
         observation, reward, terminated, truncated, _ = self.env.step(action)
-        self.observations.append(observation)
+        self.observations.append(np.array(observation))
         self.actions.append(action)
         self.rewards.append(float(reward))
         if not (terminated or truncated):
@@ -173,13 +187,6 @@ def _envs(spec: str, count: int) -> list[gym.Env[Any, Any]]:
     return pool[:count]
 
 
-def make_env(spec: str) -> gym.Env[Any, Any]:
-    """Make the environment of an EnvSpec in JSON, without the step-by-step checker."""
-    env_spec = EnvSpec.from_json(spec)
-    env_spec.disable_env_checker = True
-    return gym.make(env_spec)
-
-
 class Rollouts:
     """Plays episodes of one environment, in this process (workers = 0) or in a pool of worker processes.
 
@@ -203,8 +210,11 @@ class Rollouts:
     def submit(self, task: Task) -> Future[Any]:
         """Start a task; its result is the list that `play` returns."""
         if self._pool:
-            with _no_ctrl_c():  # submitting may start a worker; half a start would leave the pool unusable
-                return self._pool.submit(play, task)
+            with _quiet_start():
+                try:
+                    return self._pool.submit(play, task)
+                except BrokenProcessPool:
+                    raise _worker_died() from None
         future: Future[Any] = Future()
         future.set_result(play(task))
         return future
@@ -250,9 +260,13 @@ def result(future: Future[Any]) -> Any:
     try:
         return future.result()
     except BrokenProcessPool:
-        raise OffbenchError(
-            "a worker process died (killed, or out of memory); run the same command again, with fewer --workers"
-        ) from None
+        raise _worker_died() from None
+
+
+def _worker_died() -> OffbenchError:
+    return OffbenchError(
+        "a worker process died (killed, or out of memory); run the same command again, with fewer --workers"
+    )
 
 
 def _gather(futures: Sequence[Future[Any]]) -> Future[list[Outcome]]:
@@ -279,22 +293,33 @@ def _gather(futures: Sequence[Future[Any]]) -> Future[list[Outcome]]:
 
 
 @contextlib.contextmanager
-def _no_ctrl_c() -> Iterator[None]:
-    """Hold Ctrl-C back for a moment; processes started meanwhile never see it at all."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def _quiet_start() -> Iterator[None]:
+    """Let a worker start undisturbed: submitting a task may start one.
+
+    Ctrl-C is held back meanwhile (half a start would leave the pool unusable), and the user's script is hidden:
+    a spawned process would run it again, and a worker needs nothing of it.
+    """
+    masks = hasattr(signal, "pthread_sigmask")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        sys.modules["__main__"] = script
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _start_worker(parent: int) -> None:
     """Leave Ctrl-C to the parent, and end when the parent is gone (even by kill -9)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+
+
+def loaded(names: Sequence[str]) -> list[str]:
+    """Return which of these modules this process has loaded (a worker should have no PyTorch)."""
+    return [name for name in names if name in sys.modules]
 
 
 def _watch(parent: int) -> None:

@@ -22,6 +22,8 @@ from offbench.errors import OffbenchError
 from offbench.files import csv_bytes, read_json, write_bytes, write_json
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
+FORMAT = "offbench-run-1"
+REQUIRED = ("algorithm", "variant", "settings", "dataset", "dataset_sha256", "seed", "steps", "references")
 MUST_MATCH = ("algorithm", "settings", "dataset", "dataset_sha256", "seed", "eval_every", "eval_episodes")
 
 
@@ -49,9 +51,10 @@ class Run:
     def config(self) -> dict[str, Any]:
         """Read config.json. Raises OffbenchError if it is missing or damaged."""
         config = read_json(self.config_path)
-        if not isinstance(config, dict):
-            raise OffbenchError(f"{self.config_path} is damaged: not a table")
-        return config
+        missing = [key for key in REQUIRED if not isinstance(config, dict) or key not in config]
+        if missing:
+            raise OffbenchError(f"{self.config_path} is damaged: it lacks {missing[0]}; delete the run to repeat it")
+        return dict(config)
 
     def claim(self, config: Mapping[str, Any]) -> None:
         """Write config.json, or check that the run in this directory is the same one.
@@ -113,8 +116,11 @@ class Run:
         path = self.folder / "losses.csv"
         if not path.exists():
             return []
-        with open(path, newline="", encoding="utf-8") as file:
-            return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file)]
+        try:
+            with open(path, newline="", encoding="utf-8") as file:
+                return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
+        except (ValueError, TypeError, csv.Error) as error:
+            raise OffbenchError(f"{path} is damaged: {error}; delete the run to repeat it") from None
 
 
 def _short(value: Any) -> Any:
@@ -122,8 +128,13 @@ def _short(value: Any) -> Any:
 
 
 def find_runs(root: Path) -> list[Run]:
-    """Return all runs below a folder, in order of their paths."""
-    return [Run(path.parent) for path in sorted(root.rglob("config.json"))]
+    """Return all runs below a folder, in order of their paths; other programs' config.json are passed over."""
+    return [Run(path.parent) for path in sorted(root.rglob("config.json")) if _is_run(path)]
+
+
+def _is_run(path: Path) -> bool:
+    config = read_json(path)
+    return isinstance(config, dict) and config.get("format") == FORMAT
 
 
 def run_folder(root: Path, dataset_id: str, algorithm: str, variant: str, seed: int) -> Path:

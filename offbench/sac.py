@@ -29,17 +29,16 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from offbench import checkpoints, seeds
 from offbench.checkpoints import keep_newest, load_newest, save_checkpoint
+from offbench.environments import make_env
 from offbench.errors import OffbenchError
 from offbench.files import csv_bytes, disk_errors, read_json, write_bytes, write_json
 from offbench.policy import Array, Policy
 from offbench.progress import Progress
 from offbench.provenance import hardware, versions
 from offbench.recipes import Recipe
-from offbench.rollout import Rollouts, make_env
-from offbench.scores import interval
+from offbench.rollout import MEASURES, Rollouts, summary
 from offbench.seeds import Purpose
 
-MEASURES = ("return", "low", "high", "length")
 SCREENED = ("step", "hours", *(f"{how}_{m}" for how in ("stochastic", "deterministic") for m in MEASURES), "episodes")
 OPTIMISERS = ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer")
 
@@ -186,18 +185,10 @@ def _screen(rollouts: Rollouts, policy: Policy, seed: int, step: int, episodes: 
     """Measure a rung over a few episodes: enough to choose candidates, not to publish."""
     row: dict[str, float] = {}
     for how, deterministic in (("stochastic", False), ("deterministic", True)):
-        outcomes = rollouts.outcomes(
-            policy, seed, (int(Purpose.RUNG), step, int(deterministic)), episodes, deterministic
-        ).result()
-        row |= describe(how, [o.ret for o in outcomes], [o.length for o in outcomes])
+        stream = (int(Purpose.RUNG), step, int(deterministic))
+        outcomes = rollouts.outcomes(policy, seed, stream, episodes, deterministic).result()
+        row |= summary(outcomes, f"{how}_")
     return row | {"episodes": episodes}
-
-
-def describe(how: str, returns: list[float], lengths: list[int]) -> dict[str, float]:
-    """Return mean return, its 95% interval and mean length as columns of a ladder."""
-    mean, low, high = interval(returns)
-    values = {"return": mean, "low": low, "high": high, "length": float(np.mean(lengths))}
-    return {f"{how}_{key}": round(value, 4) for key, value in values.items()}
 
 
 def _save_segment(

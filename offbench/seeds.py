@@ -23,7 +23,6 @@ class Purpose(IntEnum):
     WEIGHTS = 7  # initial weights of network i
     CHUNK = 8  # batches and noise of chunk i of a run
     EVALUATION = 9  # the episodes of a run's evaluation at step i
-    MIX = 10  # part i of a blend of levels
     SAMPLE = 11  # which transitions or episodes a picture or a check looks at
 
 

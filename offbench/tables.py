@@ -30,15 +30,7 @@ def score_runs(runs: str | Path = "runs") -> list[Row]:
     Raises:
         OffbenchError: the folder holds no evaluated run, or a damaged one.
     """
-    groups: dict[tuple[str, str, str], list[tuple[Run, dict[str, Any]]]] = {}
-    for run in find_runs(Path(runs)):
-        config = run.config()
-        if config.get("format") == "offbench-run-1" and run.evaluations_path.exists() and run.evaluations():
-            key = (config["dataset"], config["algorithm"], config["variant"])
-            groups.setdefault(key, []).append((run, config))
-    if not groups:
-        raise OffbenchError(f"no evaluated runs below {runs}; start one with `offbench train ALGO --dataset ID`")
-    return [_row(*key, group) for key, group in sorted(groups.items())]
+    return [_row(*key[:3], group) for key, group in evaluated_groups(runs).items()]
 
 
 def _row(dataset: str, algorithm: str, variant: str, group: list[tuple[Run, dict[str, Any]]]) -> Row:
@@ -74,7 +66,7 @@ def score_returns(env: str, returns: Sequence[float], behaviour_dir: str | Path 
         raise OffbenchError(f"returns must be finite numbers, not {list(returns)}")
     folders = [recipe.folder / "behaviour"] if recipe.folder else []
     folders.append(Path(behaviour_dir) / recipe.name / "seed-0" / "ladder")
-    ladder = next((found for folder in folders if (found := read_ladder(folder))), None)
+    ladder = next((found.check(recipe) for folder in folders if (found := read_ladder(folder))), None)
     ours = (ladder.random_return, ladder.expert_return) if ladder else None
     d4rl = (recipe.d4rl_min, recipe.d4rl_max) if recipe.d4rl_min is not None else None
     if not ours and not d4rl:
@@ -88,6 +80,26 @@ def score_returns(env: str, returns: Sequence[float], behaviour_dir: str | Path 
         }
         for value in returns
     ]
+
+
+Groups = dict[tuple[str, str, str, str], list[tuple[Run, dict[str, Any]]]]
+
+
+def evaluated_groups(runs: str | Path) -> Groups:
+    """Return the evaluated runs below a folder by (dataset, algorithm, variant, dataset content), sorted.
+
+    Raises:
+        OffbenchError: there are none, or one is damaged.
+    """
+    groups: Groups = {}
+    for run in find_runs(Path(runs)):
+        config = run.config()
+        if run.evaluations():
+            key = (config["dataset"], config["algorithm"], config["variant"], config["dataset_sha256"])
+            groups.setdefault(key, []).append((run, config))
+    if not groups:
+        raise OffbenchError(f"no evaluated runs below {runs}; start one with `offbench train ALGO --dataset ID`")
+    return dict(sorted(groups.items()))
 
 
 def normalize_runs_or_returns(

@@ -210,6 +210,7 @@ class Stack:
             origin,
             critic=critic,
             samples=parts.samples,
+            activation=parts.activation,
         )
 
     def run_tensors(self, run: int) -> dict[str, Tensor]:
@@ -235,8 +236,8 @@ class Stack:
             bad = [n for n, t in self.run_tensors(run).items() if not bool(torch.isfinite(t).all())]
             if bad:
                 raise OffbenchError(
-                    f"{member.run.folder}: {bad[0]} became NaN or infinite by step {self.step}; "
-                    "the last checkpoint is kept; try a smaller learning rate"
+                    f"{member.run.folder}: {bad[0]} became NaN or infinite by step {self.step}; its last checkpoint "
+                    f"is kept; try a smaller learning rate, or train the others without seed {member.seed}"
                 )
 
 
@@ -262,7 +263,7 @@ class Trainer:
             if spec:
                 self.rollouts = resources.enter_context(Rollouts(spec, self.schedule.workers))
             progress = resources.enter_context(Progress(self.schedule.steps, self.title, start=self.stack.step))
-            if self.stack.step:
+            if self._evaluates_at(self.stack.step) and self.stack.step:
                 self._evaluate()
             while self.stack.step < self.schedule.steps:
                 self._train_to(self._next_stop(), progress)
@@ -300,7 +301,8 @@ class Trainer:
                 break
         for run, member in enumerate(self.members):
             known, rows = member.run.evaluations(), member.run.losses()
-            self.evaluations[run] = {s: e for s, e in known.items() if s <= self.stack.step}
+            # an evaluation at the end of a shorter schedule may lie off this one's grid
+            self.evaluations[run] = {s: e for s, e in known.items() if s <= self.stack.step and self._evaluates_at(s)}
             self.losses[run] = [row for row in rows if row["step"] <= self.stack.step]
 
     def _checkpoint(self) -> None:

@@ -26,11 +26,11 @@ import numpy as np
 from filelock import FileLock
 
 from offbench import dataset
+from offbench.environments import box
 from offbench.errors import OffbenchError
 from offbench.files import disk_errors, write_json
 from offbench.policy import Array
 from offbench.progress import Progress
-from offbench.recipes import box
 
 ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
 CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding are worth a warning
@@ -41,7 +41,7 @@ class Transitions:
     """A dataset as flat arrays, mapped from the cache (see the module's drawing)."""
 
     dataset_id: str
-    content: str
+    content: str  # SHA-256 over the arrays, the same as in an offbench dataset's metadata
     observations: Array
     rows: Array
     actions: Array
@@ -127,7 +127,7 @@ def _key(dataset_id: str, metadata: dict[str, Any]) -> str:
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     seen = [(str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
     content = dataset.provenance(metadata).get("content_sha256")
-    text = json.dumps([2, dataset_id, content, str(folder), seen])
+    text = json.dumps([3, dataset_id, content, str(folder), seen])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
@@ -145,12 +145,14 @@ def _open(dataset_id: str) -> Any:
 def _convert(data: Any, dataset_id: str, observations: gym.spaces.Box, actions: gym.spaces.Box, folder: Path) -> None:
     """Read every episode once and write the arrays; meta.json comes last, then the folder gets its name."""
     columns: dict[str, list[Array]] = {name: [] for name in ("observations", "actions", "rewards", "masks")}
-    content, lengths, returns = hashlib.sha256(), [], []
+    content, lengths, returns = dataset.ContentHash(), [], []
     with Progress(int(data.total_steps), f"converting {dataset_id}") as progress:
         for episode in _episodes(data, dataset_id):
             flat = _episode_arrays(episode, observations, actions, f"{dataset_id}, episode {episode.id}")
+            flags = bool(episode.terminations[-1]), bool(episode.truncations[-1])
+            observed, acted, earned = map(np.asarray, (episode.observations, episode.actions, episode.rewards))
+            content.add(observed, acted, earned, flags)
             for name, array in flat.items():
-                content.update(array.tobytes())
                 columns[name].append(array)
             lengths.append(len(flat["rewards"]))
             returns.append(float(np.sum(episode.rewards, dtype=np.float64)))
@@ -164,15 +166,28 @@ def _convert(data: Any, dataset_id: str, observations: gym.spaces.Box, actions: 
     arrays["rows"] = np.arange(ends[-1]) + np.repeat(np.arange(len(lengths)), lengths)
     arrays |= {"ends": ends, "returns": np.array(returns)}
     aside = folder.with_name(f".{folder.name}.{os.getpid()}")
+    source = str(dataset.path_of(dataset_id))
+    _forget(source)
     aside.mkdir()
     try:
         for name in ARRAYS:
             np.save(aside / f"{name}.npy", arrays[name], allow_pickle=False)
-        write_json(aside / "meta.json", {"dataset_id": dataset_id, "content_sha256": content.hexdigest()})
+        write_json(aside / "meta.json", {"source": source, "content_sha256": content.hexdigest()})
         shutil.rmtree(folder, ignore_errors=True)
         aside.replace(folder)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
+
+
+def _forget(source: str) -> None:
+    """Delete what was converted from an earlier content of the same dataset."""
+    for meta in cache().glob("*/meta.json"):
+        try:
+            superseded = json.loads(meta.read_text()).get("source") == source
+        except (OSError, ValueError, AttributeError):
+            continue
+        if superseded:
+            shutil.rmtree(meta.parent, ignore_errors=True)
 
 
 def _episodes(data: Any, dataset_id: str) -> Iterator[Any]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import os
+import json
+import shutil
 import warnings
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 import offbench
 from offbench import dataset
 from offbench.cli import main
+from tests.conftest import TINY_RECIPE
 from tests.test_transitions import episode, foreign
 
 CASES: dict[str, tuple[str, str]] = {
@@ -47,7 +49,7 @@ CASES: dict[str, tuple[str, str]] = {
     "train bdb --dataset x-v0": ("unknown dataset 'x-v0'", "offbench collect"),
     "train bdb --dataset ../x-v0": ("unknown dataset '../x-v0'", ""),
     "train bdb --dataset MEDIUM --beta 2": ("bdb: beta must be at most 1, not 2", ""),
-    "train bdb --dataset MEDIUM --beta adaptve": ("beta must be one of adaptive, not 'adaptve'", ""),
+    "train bdb --dataset MEDIUM --beta adaptve": ("beta must be one of adaptive, learned, not 'adaptve'", ""),
     "train bdb --dataset MEDIUM --alpha nan": ("alpha must be a finite number", ""),
     "train bdb --dataset MEDIUM --alpha -1": ("alpha must be at least 0", ""),
     "train bdb --dataset MEDIUM --critics 1": ("critics must be at least 2", ""),
@@ -100,7 +102,8 @@ def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
         main(words)
     out, err = capsys.readouterr()
     assert stopped.value.code == 2
-    lines = [line for line in err.splitlines() if not line.startswith("converting ")]
+    notices = ("converting ", "offbench: using the behaviour agent")
+    lines = [line for line in err.splitlines() if not line.startswith(notices)]
     assert len(lines) == 1, err
     assert lines[0].startswith("offbench: ")
     assert "Traceback" not in out + err
@@ -154,12 +157,18 @@ def test_more_replay_than_there_is(tiny: tuple[str, str], capsys: pytest.Capture
     assert "use fewer --steps" in refusal(words, capsys)
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
-def test_a_read_only_folder(tiny: tuple[str, str], home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recipe, behaviour_dir = tiny
-    dataset.root().mkdir()
-    dataset.root().chmod(0o500)
-    assert "cannot write" in refusal(["collect", recipe, "--behaviour-dir", behaviour_dir], capsys)
+def test_a_refusing_disk(
+    tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A read-only folder, as root meets it in a container: the operating system refuses to make a folder."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(dataset.Path, "mkdir", refuse)
+    line = refusal(["collect", tiny[0], "--behaviour-dir", tiny[1]], capsys)
+    assert "cannot write" in line
+    assert "Permission denied" in line
 
 
 def test_a_file_where_a_folder_should_be(
@@ -185,6 +194,63 @@ def test_datasets_of_different_shapes_do_not_stack(medium: str) -> None:
     foreign("other-v0", [episode(3, 0, True)])
     with pytest.raises(offbench.OffbenchError, match="one stack must have the same shapes"):
         offbench.train("td3_bc", [medium, "other-v0"], steps=10, hidden=(8,))
+
+
+def test_datasets_of_different_environments_do_not_stack(tiny: tuple[str, str], medium: str, home: Path) -> None:
+    """The same shapes, another time limit: evaluations and references would be mixed up."""
+    path = home / "minari" / medium / "data" / "metadata.json"
+    shutil.copytree(home / "minari" / medium, home / "minari" / "longer-v0")
+    metadata = json.loads(path.read_text())
+    spec = json.loads(metadata["eval_env_spec"]) | {"max_episode_steps": 500}
+    changed = metadata | {"eval_env_spec": json.dumps(spec), "dataset_id": "longer-v0"}
+    (home / "minari" / "longer-v0" / "data" / "metadata.json").write_text(json.dumps(changed))
+    with pytest.raises(offbench.OffbenchError, match="must be of one environment"):
+        offbench.train("td3_bc", [medium, "longer-v0"], steps=10, hidden=(8,))
+    assert not list(home.glob("runs/**/config.json"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"entry_point": "os:system", "kwargs": {"command": "touch PWNED"}, "id": "Evil-v0"}, "is no Env class"),
+        ({"entry_point": "no_such_module:Env", "id": "Gone-v0"}, "cannot make its environment"),
+        ({"id": "Hopper-v5", "entry_point": "gymnasium.envs.mujoco.hopper_v5:HopperEnv"}, "has \\(11,\\) and"),
+        (
+            {"additional_wrappers": [{"name": "x", "entry_point": "os:system", "kwargs": {"command": "touch PWNED"}}]},
+            "is no Wrapper class",
+        ),
+    ],
+)
+def test_an_environment_named_by_a_file_is_not_simply_run(
+    medium: str, home: Path, change: dict[str, Any], message: str
+) -> None:
+    path = home / "minari" / medium / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    spec = json.loads(metadata["eval_env_spec"])
+    spec = {**spec, "kwargs": {}, **change}
+    path.write_text(json.dumps(metadata | {"eval_env_spec": json.dumps(spec)}))
+    with pytest.raises(offbench.OffbenchError, match=message):
+        offbench.train("td3_bc", medium, steps=10, hidden=(8,))
+    assert not (home / "PWNED").exists()
+
+
+def test_a_ladder_never_replaces_other_files(tiny: tuple[str, str], home: Path) -> None:
+    (home / "results").mkdir()
+    (home / "results" / "thesis.tex").write_text("years of work")
+    with pytest.raises(offbench.OffbenchError, match="holds other files"):
+        offbench.behaviour(tiny[0], behaviour_dir=tiny[1], out="results")
+    assert (home / "results" / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_ladder_of_another_environment_is_refused(tiny: tuple[str, str], home: Path) -> None:
+    (home / "tiny.toml").write_text(TINY_RECIPE + "\n[env_kwargs]\nframe_skip = 4\n")
+    with pytest.raises(offbench.OffbenchError, match=r"the recipe is of InvertedPendulum-v5 \{'frame_skip': 4\}"):
+        offbench.collect("./tiny.toml", behaviour_dir=tiny[1])
+
+
+def test_a_share_of_nothing(tiny: tuple[str, str]) -> None:
+    with pytest.raises(offbench.OffbenchError, match="leave a part of the blend without a transition"):
+        offbench.collect(tiny[0], mix="random:0.01,expert:0.99", steps=10, behaviour_dir=tiny[1])
 
 
 def test_a_policy_for_another_environment(medium: str, capsys: pytest.CaptureFixture[str]) -> None:

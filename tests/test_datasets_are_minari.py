@@ -182,3 +182,56 @@ def test_a_failed_recording_leaves_the_old_dataset(tiny: tuple[str, str], monkey
         offbench.collect(recipe, "random", behaviour_dir=behaviour_dir, workers=1, steps=60, overwrite=True)
     assert json.dumps(dataset.read_metadata(name)) == before
     assert [p.name for p in dataset.root().iterdir() if not p.name.endswith(".lock")] == [name]
+
+
+@pytest.mark.parametrize("moment", ["before", "after"])
+def test_a_replacement_that_fails_at_the_last_moment_keeps_the_old_dataset(
+    tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    """The renames themselves fail, or the process dies between them (then the next command mends it)."""
+    recipe, behaviour_dir = tiny
+    name = offbench.collect(recipe, "random", behaviour_dir=behaviour_dir, workers=1, steps=50)
+    before = json.dumps(dataset.read_metadata(name))
+    path = dataset.path_of(name)
+    if moment == "after":
+        path.rename(path.with_name(f".offbench-{name}.old"))
+        with pytest.raises(OffbenchError, match="exists already"):
+            offbench.collect(recipe, "random", behaviour_dir=behaviour_dir, workers=1, steps=60)
+    else:
+        original = Path.replace
+
+        def fail(self: Path, target: Path) -> Path:
+            if self.name.endswith(".partial"):
+                raise OSError(5, "Input/output error")
+            return original(self, target)
+
+        monkeypatch.setattr(Path, "replace", fail)
+        with pytest.raises(OffbenchError, match="Input/output error"):
+            offbench.collect(recipe, "random", behaviour_dir=behaviour_dir, workers=1, steps=60, overwrite=True)
+    assert json.dumps(dataset.read_metadata(name)) == before
+
+
+def test_loading_finds_the_recorded_content_hash(medium: str) -> None:
+    assert offbench.load(medium).content == dataset.provenance(dataset.read_metadata(medium))["content_sha256"]
+
+
+def test_environments_that_reuse_their_array_are_recorded_right() -> None:
+    from offbench.policy import uniform
+    from offbench.rollout import Task, _Lane
+
+    class Reusing(gym.Env[Any, Any]):
+        def __init__(self) -> None:
+            self.state = np.zeros(1)
+
+        def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+            self.state[:] = 0
+            return self.state, {}
+
+        def step(self, _: Any) -> Any:
+            self.state += 1
+            return self.state, 0.0, bool(self.state[0] == 3), False, {}
+
+    policy = uniform(np.full(1, -1, np.float32), np.full(1, 1, np.float32), 1, "X-v0")
+    lane = _Lane(Reusing(), policy, Task("", b"", 0, (), (0,), False, False), 0)
+    episode = next(e for e in (lane.step(np.zeros(1, np.float32)) for _ in range(9)) if e)
+    np.testing.assert_array_equal(episode.observations[:, 0], [0, 1, 2, 3])

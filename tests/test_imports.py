@@ -58,6 +58,22 @@ assert "torch" not in sys.modules, "torch was imported"
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=home)
 
 
-def test_rollout_workers_do_not_load_pytorch(home: Path) -> None:
-    code = "import sys, offbench.rollout; assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=home)
+def test_rollout_workers_load_neither_pytorch_nor_the_users_script(home: Path) -> None:
+    """A plain script without `if __name__ == "__main__"`: its workers must not run it again."""
+    (home / "script.py").write_text(
+        """
+print("script runs")
+import numpy as np
+from offbench.environments import env_spec
+from offbench.policy import uniform
+from offbench.rollout import Rollouts
+
+with Rollouts(env_spec("InvertedPendulum-v5"), workers=1) as rollouts:
+    policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
+    print(len(rollouts.outcomes(policy, 0, (), 3, True).result()), "episodes")
+    from offbench.rollout import loaded
+    print("worker has", rollouts._pool.submit(loaded, ("torch", "stable_baselines3")).result())
+"""
+    )
+    done = subprocess.run([sys.executable, "script.py"], check=True, cwd=home, capture_output=True, text=True)
+    assert done.stdout.splitlines() == ["script runs", "3 episodes", "worker has []"]

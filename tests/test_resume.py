@@ -35,7 +35,7 @@ def test_every_algorithm_is_tested_here() -> None:
     assert set(EXTRA) == set(algorithm_names())
 
 
-def train(algorithm: str, dataset: str, runs: str, steps: int, **more: Any) -> list[Run]:
+def train(algorithm: str, dataset: str | list[str], runs: str, steps: int, **more: Any) -> list[Run]:
     settings = SMALL | EXTRA[algorithm] | more
     return [Run(path) for path in offbench.train(algorithm, dataset, steps=steps, runs=runs, **settings)]
 
@@ -89,7 +89,44 @@ def test_fewer_steps_than_there_are_do_not_undo_a_run(medium: str) -> None:
     assert checkpoints.steps(run.folder) == [400, 300]
     with pytest.raises(OffbenchError, match="is at step 400 already; give --steps 400"):
         train("td3_bc", medium, "runs", 200)
+    with pytest.raises(OffbenchError, match="is at step 400 already"):
+        train("td3_bc", medium, "runs", 350)
+    train("td3_bc", medium, "runs", 300)  # finished at exactly 300 too: nothing to do
     assert run.evaluations().keys() == {100, 200, 300, 400}
+    assert checkpoints.steps(run.folder) == [400, 300]
+
+
+def test_an_evaluation_off_the_grid_goes_when_a_run_is_extended(medium: str) -> None:
+    """A run extended from 150 to 300 scores like one that went straight there."""
+    (straight,) = train("td3_bc", medium, "straight", 300)
+    (run,) = train("td3_bc", medium, "runs", 150)
+    assert run.evaluations().keys() == {100, 150}
+    train("td3_bc", medium, "runs", 300)
+    assert run.evaluations() == straight.evaluations()
+    assert run.policy_path.read_bytes() == straight.policy_path.read_bytes()
+
+
+def test_two_datasets_in_a_stack_equal_each_alone(tiny: tuple[str, str], medium: str) -> None:
+    """Offsets, sizes and normalisers of each dataset: together as apart."""
+    other = offbench.collect(tiny[0], "random", behaviour_dir=tiny[1], workers=1, steps=437)
+    stack = train("bdb", [other, medium], "stack", 200, seeds=[0, 1])
+    for run in stack:
+        config = run.config()
+        (alone,) = train("bdb", config["dataset"], "alone", 200, seeds=config["seed"])
+        ours, theirs = (load_file(r.folder / "checkpoint-000000200.safetensors") for r in (run, alone))
+        for name in ours:
+            torch.testing.assert_close(ours[name], theirs[name], atol=1e-4, rtol=0)
+
+
+def test_a_learned_beta_beside_a_fixed_one_resumes_right(medium: str) -> None:
+    whole = train("bdb", medium, "whole", 200, beta=["learned", 0.25], beta_learning_rate=1e-2)
+    for beta in ("learned", 0.25):  # apart first, then together
+        train("bdb", medium, "runs", 100, beta=beta, beta_learning_rate=1e-2)
+    together = train("bdb", medium, "runs", 200, beta=["learned", 0.25], beta_learning_rate=1e-2)
+    for a, b in zip(whole, together, strict=True):
+        ours, theirs = (load_file(run.folder / "checkpoint-000000200.safetensors") for run in (a, b))
+        for name in ours:
+            torch.testing.assert_close(ours[name], theirs[name], atol=1e-4, rtol=0)
 
 
 def test_a_stack_killed_between_two_checkpoints_goes_on_from_the_older(medium: str) -> None:

@@ -260,7 +260,7 @@ def test_the_learned_betas_gradient_by_hand() -> None:
     algorithm = make("bdb", [{"beta": "learned", "beta_target": 0.05}])
     with torch.no_grad():
         algorithm.learned_beta.flat.fill_(0.4)
-    loss = learned_beta_loss(algorithm.learned_beta, torch.tensor([0.3]), algorithm.config)
+    loss = learned_beta_loss(algorithm.learned_beta, torch.tensor([0.3]), algorithm.config, False)
     (gradient,) = torch.autograd.grad(loss.sum(), [algorithm.learned_beta.flat])
     s = torch.sigmoid(torch.tensor(0.4))
     torch.testing.assert_close(gradient.flatten(), (s * (1 - s) * 0.25).view(1))

@@ -16,9 +16,9 @@ import pytest
 
 import offbench
 from offbench import dataset, seeds
+from offbench.environments import env_spec
 from offbench.errors import OffbenchError
 from offbench.policy import uniform
-from offbench.recipes import env_spec
 from offbench.record import cut_at
 from offbench.rollout import LANES, Episode, Rollouts, Task, play, result
 from offbench.seeds import Purpose

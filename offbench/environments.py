@@ -1,0 +1,115 @@
+"""Environments: made from a recipe's id, or from the EnvSpec that a dataset or a run carries.
+
+An EnvSpec names the code that makes the environment, so one that came in a file is checked before it is believed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+
+from offbench.errors import OffbenchError
+
+WHAT_MATTERS = ("id", "kwargs", "max_episode_steps")  # what makes two specs the same environment
+
+
+def env_spec(env_id: str, **kwargs: Any) -> str:
+    """Return Gymnasium's EnvSpec of `env_id` as JSON, checked to have flat Box spaces and bounded actions.
+
+    Raises:
+        OffbenchError: it cannot be made, or its spaces are of another kind.
+    """
+    try:
+        env = gym.make(env_id, **kwargs)
+        assert env.spec is not None
+        text = env.spec.to_json()
+    except Exception as error:  # a third-party environment may raise anything here
+        raise OffbenchError(f"cannot make the environment {env_id!r}: {_reason(error)}") from error
+    _check_spaces(env, env_id)
+    return text
+
+
+def checked_spec(text: str, where: str, observation_dim: int, action_dim: int) -> str:
+    """Return the EnvSpec JSON that a file carries if it can be believed, made, and fits.
+
+    Raises:
+        OffbenchError: it names code that is no Gymnasium environment, cannot be made, or has other shapes.
+    """
+    try:
+        spec = EnvSpec.from_json(text)
+        _check_code(spec)
+        env = make_env(text)
+    except OffbenchError as error:
+        raise OffbenchError(f"{where}: {error}") from None
+    except Exception as error:  # see env_spec
+        raise OffbenchError(
+            f"{where}: cannot make its environment: {_reason(error)}; install or import the package it comes from"
+        ) from error
+    _check_spaces(env, where)
+    shapes = (env.observation_space.shape, env.action_space.shape)
+    if shapes != ((observation_dim,), (action_dim,)):
+        raise OffbenchError(
+            f"{where} takes observations ({observation_dim},) and actions ({action_dim},); the environment {spec.id} "
+            f"has {shapes[0]} and {shapes[1]}: give the right one"
+        )
+    return text
+
+
+def _check_code(spec: EnvSpec) -> None:
+    """Refuse entry points that are no environments: `os:system` would run whatever a file says."""
+    registered = gym.registry.get(spec.id)
+    if registered is None or registered.entry_point != spec.entry_point:
+        _check_class(spec.entry_point, gym.Env)
+    for wrapper in spec.additional_wrappers:
+        _check_class(wrapper.entry_point, gym.Wrapper)
+
+
+def _check_class(entry_point: Any, base: type) -> None:
+    module, _, name = str(entry_point).partition(":")
+    found = getattr(importlib.import_module(module), name, None)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise OffbenchError(f"its entry point {entry_point!r} is no {base.__name__} class, it is not run")
+
+
+def make_env(spec: str) -> gym.Env[Any, Any]:
+    """Make the environment of an EnvSpec in JSON, without the step-by-step checker."""
+    made = EnvSpec.from_json(spec)
+    made.disable_env_checker = True
+    return gym.make(made)
+
+
+def same_environment(a: str | None, b: str | None) -> bool:
+    """Return whether two EnvSpecs (JSON) are the same environment; versions of wrappers do not count."""
+    if a is None or b is None:
+        return a is b
+    first, second = json.loads(a), json.loads(b)
+    return all(first.get(key) == second.get(key) for key in WHAT_MATTERS)
+
+
+def _reason(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
+def _check_spaces(env: gym.Env[Any, Any], where: str) -> None:
+    try:
+        box(env.observation_space, f"{where}: observations")
+        actions = box(env.action_space, f"{where}: actions")
+        if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
+            raise OffbenchError(f"{where}: actions must be bounded, the action space is {actions}")
+    finally:
+        env.close()
+
+
+def box(space: gym.Space[Any], what: str) -> gym.spaces.Box:
+    """Return `space` if it is a flat float Box, else raise an OffbenchError that begins with `what`."""
+    if not isinstance(space, gym.spaces.Box):
+        raise OffbenchError(f"{what} must be a Box space, not {space}; wrap the environment to make it one")
+    if len(space.shape) != 1 or not np.issubdtype(space.dtype, np.floating):
+        raise OffbenchError(f"{what} must be a flat Box of floats, not {space}; wrap it in FlattenObservation")
+    return space
