@@ -13,15 +13,15 @@ PLAIN_INTERVAL = 30.0  # seconds between two plain lines
 
 
 class Progress:
-    """Counts work towards a total. Writes to stderr, so that stdout stays for results."""
+    """Counts steps towards a total. Writes to stderr, so that stdout stays for results."""
 
-    def __init__(self, total: int, what: str, unit: str = "step", start: int = 0) -> None:
-        self.total, self.what, self.unit, self.done = total, what, unit, start
+    def __init__(self, total: int, what: str, start: int = 0) -> None:
+        self.total, self.what, self.done = total, what, start
         self._first, self._note = start, ""
         self._began = self._last = time.monotonic()
         self._bar: Any = None
         if sys.stderr.isatty():
-            self._bar = tqdm(total=total, initial=start, desc=what, unit=unit, unit_scale=True, smoothing=0.05)
+            self._bar = tqdm(total=total, initial=start, desc=what, unit="step", unit_scale=True, smoothing=0.05)
 
     def __enter__(self) -> Progress:
         return self
@@ -47,8 +47,8 @@ class Progress:
         rate = (self.done - self._first) / max(self._last - self._began, 1e-9)
         left = (self.total - self.done) / rate if rate else float("inf")
         note = f", {self._note}" if self._note else ""
-        done = f"{self.done:,}/{self.total:,} {self.unit}s"
-        line = f"{self.what}: {done}, {rate:,.0f} {self.unit}s/s, {duration(left)} left{note}"
+        done = f"{self.done:,}/{self.total:,} steps"
+        line = f"{self.what}: {done}, {rate:,.0f} steps/s, {duration(left)} left{note}"
         print(line, file=sys.stderr, flush=True)
 
 

@@ -38,6 +38,7 @@ from offbench.seeds import Purpose
 
 LANES = 8  # episodes that share a policy forward
 TASK = 16  # episodes that travel together
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 NOISE_BLOCK = 1024  # actions whose noise is drawn at once
 
 
@@ -296,17 +297,22 @@ def _gather(futures: Sequence[Future[Any]]) -> Future[list[Outcome]]:
 def _quiet_start() -> Iterator[None]:
     """Let a worker start undisturbed: submitting a task may start one.
 
-    Ctrl-C is held back meanwhile (half a start would leave the pool unusable), and the user's script is hidden:
-    a spawned process would run it again, and a worker needs nothing of it.
+    Ctrl-C is held back meanwhile (half a start would leave the pool unusable), and the user's script is hidden: a
+    spawned process would run it again, and a worker needs nothing of it. A worker gets one thread for its matrix
+    products: as many threads as cores in each of as many workers made recording three times slower.
     """
     masks = hasattr(signal, "pthread_sigmask")
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
     script = sys.modules["__main__"]
     sys.modules["__main__"] = types.ModuleType("__main__")
+    threads = {name: "1" for name in THREADS if name not in os.environ}
+    os.environ |= threads
     try:
         yield
     finally:
         sys.modules["__main__"] = script
+        for name in threads:
+            del os.environ[name]
         if masks:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
