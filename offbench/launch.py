@@ -77,9 +77,10 @@ def train(
         members.append(Member(run, seed, config, data, references(data)))
     for member in members:
         member.run.claim(_config(algorithm, member, schedule, command))
-    title = f"{algorithm} on {datasets[0].dataset_id}" + (f" ({len(members)} runs)" if len(members) > 1 else "")
     with _threads(place):
         for group in together(members, steps):
+            title = f"{algorithm} on {group[0].data.dataset_id}"
+            title += f" ({len(group)} runs)" if len(group) > 1 else ""
             Trainer(kind, group, schedule, title).train()
     return [member.run.folder for member in members]
 

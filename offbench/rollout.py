@@ -299,7 +299,7 @@ def _quiet_start() -> Iterator[None]:
 
     Ctrl-C is held back meanwhile (half a start would leave the pool unusable), and the user's script is hidden: a
     spawned process would run it again, and a worker needs nothing of it. A worker gets one thread for its matrix
-    products: as many threads as cores in each of as many workers made recording three times slower.
+    products: as many threads as cores in each of as many workers made recording several times slower.
     """
     masks = hasattr(signal, "pthread_sigmask")
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
