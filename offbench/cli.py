@@ -18,6 +18,7 @@ COMMANDS = {
     "behaviour": "train an environment's behaviour agent (SAC) and build its ladder",
     "list": "environments, levels, algorithms and local datasets",
     "show": "what is in a dataset",
+    "card": "write an environment's dataset card from its five recorded levels",
 }
 
 
@@ -238,6 +239,18 @@ def _show(parser: Parser, _: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
+def _card(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("env", metavar="ENV", help="a recipe with a ladder in the folder `behaviour` beside it")
+    parser.add_argument("--out", metavar="DIR", help="where the card goes (default: <env>-card)")
+
+    def run(**arguments: Any) -> None:
+        from offbench.card import card
+
+        print(f"card in {card(**arguments)}")
+
+    parser.set_defaults(run=run)
+
+
 ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "collect": _collect,
     "train": _train,
@@ -246,6 +259,7 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "behaviour": _behaviour,
     "list": _list,
     "show": _show,
+    "card": _card,
 }
 
 

@@ -28,6 +28,7 @@ from offbench.environments import make_env
 from offbench.errors import OffbenchError
 from offbench.files import csv_bytes, disk_errors, read_json, write_bytes, write_json
 from offbench.policy import Policy, load_policy, uniform
+from offbench.provenance import versions
 from offbench.recipes import Recipe, load_recipe, names
 from offbench.rollout import MEASURES, Outcome, Rollouts, result, summary
 from offbench.scores import normalize
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 MEDIUM = 1 / 3  # of the expert's normalised return
 MEDIUM_AT_MOST = 0.45  # a rung beyond this is no medium while there is another
 CANDIDATES = 8  # late rungs that are measured to find the expert
+LOOKS = 6  # rungs that are measured to find the one nearest a return
 COLUMNS = ("step", "hours", "role", "policy", *MEASURES, *(f"deterministic_{m}" for m in MEASURES), "episodes")
 
 
@@ -182,18 +184,28 @@ class Surveyor:
             # measure only what its screening interval says might lie there
             if self.screened[step]["stochastic_high"] >= target and target <= self.measure(step) <= most:
                 return step
-        return self.nearest(target, early)
+        return self.nearest(target, most - target, early)
 
-    def nearest(self, target: float, among: Iterable[int] | None = None) -> int:
-        """Return the rung (of those `among`) whose best known return lies nearest `target`."""
+    def nearest(self, target: float, close: float, among: Iterable[int] | None = None) -> int:
+        """Return the rung (of those `among`) whose return lies nearest `target`, as measured.
+
+        The few episodes that screened the rungs say where to look: the most promising are measured in turn,
+        until one proves to lie within `close` or nothing that was not measured looks nearer.
+        """
+        steps = list(self.screened if among is None else among)
 
         def distance(step: int) -> float:
             known = self.measured.get(step, {}).get("return", self.screened[step]["stochastic_return"])
             return abs(known - target)
 
-        step = min(self.screened if among is None else among, key=distance)
-        self.measure(step)
-        return step
+        for _ in range(LOOKS):
+            step = min(steps, key=distance)
+            if step in self.measured:
+                return step
+            self.measure(step)
+            if distance(step) <= close:
+                return step
+        return min((step for step in steps if step in self.measured), key=distance)
 
 
 def check_place(out: Path) -> Path:
@@ -237,11 +249,14 @@ def build_ladder(training: Training, steps: int, out: Path, workers: int, comman
             )
         medium = surveyor.medium(worst + MEDIUM * (best - worst), worst + MEDIUM_AT_MOST * (best - worst), expert)
         parts = training.recipe.measure.rungs
-        others = {surveyor.nearest(worst + i / parts * (best - worst)) for i in range(1, parts)}
+        part = (best - worst) / parts
+        others = {surveyor.nearest(worst + i * part, part / 4) for i in range(1, parts)}
     roles: dict[int, str] = dict.fromkeys(sorted(others | {medium, expert}), "")
     for step, role in ((medium, "medium"), (expert, "expert")):
         roles[step] = f"{roles[step]}+{role}".lstrip("+")
-    info = read_json(training.folder / "training.json") | {
+    trained = read_json(training.folder / "training.json")
+    info = trained | {
+        "versions": trained["versions"] | {"offbench": versions()["offbench"]},
         "format": "offbench-ladder-1",
         "command": command,
         "steps": steps,

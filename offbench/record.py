@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from offbench import dataset
+from offbench.card import compare
 from offbench.environments import make_env
 from offbench.errors import OffbenchError
 from offbench.files import sha256
@@ -76,7 +77,9 @@ def collect(
         with Progress(total, f"recording {dataset_id}") as progress:
             streams = (recording.episodes(*item) for item in zip(parts, sources, counts, itertools.count()))
             episodes = _counted(itertools.chain.from_iterable(streams), progress)
-            dataset.write(path, episodes, recording.spec, metadata, total)
+            content = dataset.write(path, episodes, recording.spec, metadata, total)
+    if seed == 0 and steps is None and not retrain and (said := compare(recipe, name, content)):
+        print(f"offbench: {said}", file=sys.stderr)
     return dataset_id
 
 

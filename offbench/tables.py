@@ -141,14 +141,18 @@ def render(rows: Sequence[Row], style: str = "table") -> str:
     header = [TITLES.get(key, key) or key for key in keys]
     cells = [[_cell(row, key, "$\\pm$" if style == "latex" else "±") for key in keys] for row in rows]
     if style == "markdown":
-        lines = [header, ["---"] * len(header), *cells]
-        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        return "\n".join(markdown(header, cells))
     if style == "latex":
         return _latex(header, cells)
     widths = [max(len(line[i]) for line in [header, *cells]) for i in range(len(header))]
     lines = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in [header, *cells]]
     rule = ["-" * width for width in widths]
     return "\n".join("  ".join(line).rstrip() for line in [lines[0], rule, *lines[1:]])
+
+
+def markdown(header: Sequence[str], cells: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a Markdown table."""
+    return ["| " + " | ".join(line) + " |" for line in [header, ["---"] * len(header), *cells]]
 
 
 def _cell(row: Mapping[str, Any], key: str, plus_minus: str) -> str:

@@ -52,6 +52,23 @@ def test_the_expert_is_the_best_of_the_late_rungs() -> None:
     assert surveyor([500, 10, 20, 90, 80]).expert() == 40
 
 
+def test_the_nearest_rung_is_nearest_as_measured_not_as_screened() -> None:
+    """Screening promised 50 at step 20 and 30; measured, they return 90 and 10, and 48 is the better choice."""
+    found = surveyor([0, 90, 10, 48, 100])
+    for step, lucky in ((20, 50.0), (30, 51.0), (40, 46.0)):
+        found.screened[step]["stochastic_return"] = lucky
+    assert found.nearest(50, close=5) == 40
+    assert set(found.measured) == {20, 30, 40}
+
+
+def test_looking_for_the_nearest_rung_ends() -> None:
+    found = surveyor([100.0] * 20)
+    for row in found.screened.values():
+        row["stochastic_return"] = 50.0
+    found.nearest(50, close=5)
+    assert len(found.measured) == 6
+
+
 def test_the_nearest_rung_of_a_ladder() -> None:
     info = {"references": {"random": {"return": 10.0}, "expert": {"return": 110.0}}}
     rungs = tuple(Rung(i, "", "", ret, ret, ret, 9) for i, ret in enumerate([20.0, 60.0, 75.0, 110.0]))

@@ -1,0 +1,207 @@
+"""`card`: an environment's dataset card, from its ladder and its five recorded levels.
+
+    card.json   each level's statistics and content hash, and the versions they hold for
+    README.md   the same to read, with references, rungs and provenance
+    card.png    the learning curve and the histogram of returns of each level
+
+`collect` compares what it records at full size with the shipped card.json, so that everybody knows whether
+they hold the same data.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offbench import dataset
+from offbench.describe import Summary, show
+from offbench.errors import OffbenchError
+from offbench.files import read_json, write_bytes, write_json
+from offbench.ladder import Ladder, read_ladder
+from offbench.levels import LEVELS
+from offbench.provenance import versions
+from offbench.recipes import Recipe, load_recipe
+from offbench.scores import normalize
+from offbench.tables import markdown
+
+DECIDE = ("mujoco", "gymnasium", "numpy")  # the packages whose versions can change what is recorded
+BINS = 50
+BLUE, RED = "#3b6ea5", "#c4443c"
+
+
+def card(env: str, out: str | Path | None = None) -> Path:
+    """Write the card of an environment from its five recorded levels (seed 0, the recipe's size).
+
+    Args:
+        env: a shipped recipe's name, or a recipe file.
+        out: the folder of the card; default `<env>-card`.
+
+    Returns:
+        The folder.
+
+    Raises:
+        OffbenchError: a level is missing or was recorded otherwise, or there is no ladder.
+    """
+    recipe = load_recipe(env)
+    ladder = read_ladder(recipe.folder / "behaviour") if recipe.folder else None
+    if ladder is None:
+        raise OffbenchError(f"{recipe.name} has no shipped ladder to describe; build one with `offbench behaviour`")
+    levels = {level: _recorded(recipe, ladder, level) for level in LEVELS}
+    facts = {level: _facts(recipe, summary) for level, summary in levels.items()}
+    means = [facts[level]["return"] for level in ("random", "medium-replay", "medium", "medium-expert", "expert")]
+    if sorted(means) != means:
+        print(f"offbench: warning: the levels of {recipe.name} are out of order: {means}", file=sys.stderr)
+    folder = Path(out or f"{recipe.name}-card")
+    made = {name: versions()[name] for name in DECIDE}
+    write_json(folder / "card.json", {"format": "offbench-card-1", "versions": made, "levels": facts})
+    _draw(recipe, ladder, levels, folder / "card.png")
+    write_bytes(folder / "README.md", ("\n".join(_text(recipe, ladder, facts, made)) + "\n").encode())
+    return folder
+
+
+def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
+    """Return a line that says whether a level recorded at full size is the one on the shipped card.
+
+    None where the card says nothing of it: no card, or a level that is not one of the five.
+    """
+    path = recipe.folder / "card.json" if recipe.folder else None
+    if path is None or not path.exists():
+        return None
+    known = read_json(path)
+    if level not in known["levels"]:
+        return None
+    if known["levels"][level]["content_sha256"] == content_sha256:
+        return "content equal to the dataset card's, bit for bit"
+    others = [f"{name} {version}" for name, version in known["versions"].items() if versions()[name] != version]
+    reason = f"made with {', '.join(others)}" if others else "made with the same versions: another processor or libm?"
+    return f"warning: content differs from the dataset card's, {reason}"
+
+
+def _recorded(recipe: Recipe, ladder: Ladder, level: str) -> Summary:
+    """Return a recorded level, checked to be what the card claims."""
+    dataset_id = f"{recipe.name}-{level}-v{recipe.version}"
+    if dataset_id not in dataset.local_ids():
+        raise OffbenchError(
+            f"{dataset_id} is not recorded yet; first `offbench collect {recipe.name} --level {level}`"
+        )
+    found = show(dataset_id)
+    ours = dataset.provenance(found.metadata)
+    parts = LEVELS[level]
+    size = recipe.dataset_steps * sum(part.weight for part in parts)
+    if parts[0].source == "replay":
+        size = int(ladder.info["medium_replay"]["transitions"])
+    same = ours.get("references") == ladder.info["references"] and ours.get("seed") == 0
+    if not same or int(found.lengths.sum()) != size:
+        raise OffbenchError(
+            f"{dataset_id} is not the level that is shipped (seed 0, {size:,.0f} transitions, this ladder); "
+            f"record it with `offbench collect {recipe.name} --level {level} --overwrite`"
+        )
+    return found
+
+
+def _facts(recipe: Recipe, found: Summary) -> dict[str, Any]:
+    meta, returns = found.metadata, np.asarray(found.returns)
+    mean = float(returns.mean())
+    d4rl = None
+    if recipe.d4rl_min is not None and recipe.d4rl_max is not None:
+        d4rl = round(normalize(mean, recipe.d4rl_min, recipe.d4rl_max), 2)
+    return {
+        "transitions": int(found.lengths.sum()),
+        "episodes": len(returns),
+        "return": round(mean, 2),
+        "std": round(float(returns.std()), 2),
+        "min": round(float(returns.min()), 2),
+        "max": round(float(returns.max()), 2),
+        "score": round(normalize(mean, float(meta["ref_min_score"]), float(meta["ref_max_score"])), 2),
+        "d4rl_score": d4rl,
+        "terminated": round(found.terminated, 4),
+        "content_sha256": dataset.provenance(meta)["content_sha256"],
+    }
+
+
+def _text(recipe: Recipe, ladder: Ladder, facts: Mapping[str, Any], made: Mapping[str, str]) -> Iterator[str]:
+    info, references = ladder.info, ladder.info["references"]
+    yield f"# {recipe.name}: {recipe.env_id}"
+    yield from ("", f"Made by `offbench card {recipe.name}`; the same numbers for programs: `card.json`.", "")
+    yield from ("![Learning curve of the behaviour agent; returns of each level](card.png)", "", "## Levels", "")
+    header = ["level", "transitions", "episodes", "mean return", "std", "min", "max"]
+    header += ["score (own ref.)", "score (D4RL ref.)", "episodes terminated"]
+    yield from markdown(header, [_cells(level, values) for level, values in facts.items()])
+    yield from ("", "Returns are per episode; std over episodes. An episode that the level's size cuts is truncated.")
+    yield from ("", "## References", "")
+    yield from markdown(
+        ["policy", "score", "mean return", "95% interval", "episodes"],
+        [
+            [name, score, f"{ref['return']:.1f}", f"{ref['low']:.1f} to {ref['high']:.1f}", str(ref["episodes"])]
+            for name, score, ref in (("random", "0", references["random"]), ("expert", "100", references["expert"]))
+        ],
+    )
+    yield from ("", "## Behaviour agent", "")
+    sac, where = info["sac"], info["hardware"]
+    yield (
+        f"Stable-Baselines3's SAC, seed {info['seed']}: {info['steps']:,} environment steps, "
+        f"{sac['gradient_steps']:g} gradient steps for each, {info['hours']:.1f} hours on one core "
+        f"({where['processor']}). Command: `{info['command']}`; settings and why: [recipe.toml](recipe.toml); "
+        "every rung: [behaviour/ladder.csv](behaviour/ladder.csv)."
+    )
+    yield from (
+        "",
+        "Policies kept, by measured return of the sampling policy; `--level FRACTION` takes the nearest:",
+        "",
+    )
+    yield from markdown(
+        ["step", "mean return", "95% interval", "fraction of expert", "level"],
+        [
+            [f"{r.step:,}", f"{r.ret:.1f}", f"{r.low:.1f} to {r.high:.1f}", f"{ladder.fraction(r):.2f}", r.role]
+            for r in ladder.rungs
+        ],
+    )
+    yield from ("", "## Content", "")
+    yield f"SHA-256 over the arrays in episode order, for {', '.join(f'{n} {v}' for n, v in made.items())}:"
+    yield ""
+    yield from markdown(["level", "content"], [[level, f"`{v['content_sha256']}`"] for level, v in facts.items()])
+    yield from ("", "`offbench collect` says whether what it recorded is the same.")
+
+
+def _cells(level: str, values: Mapping[str, Any]) -> list[str]:
+    d4rl = "-" if values["d4rl_score"] is None else f"{values['d4rl_score']:.1f}"
+    spread = [f"{values[key]:,.1f}" for key in ("return", "std", "min", "max", "score")]
+    return [
+        level,
+        f"{values['transitions']:,}",
+        f"{values['episodes']:,}",
+        *spread,
+        d4rl,
+        f"{100 * values['terminated']:.1f}%",
+    ]
+
+
+def _draw(recipe: Recipe, ladder: Ladder, levels: Mapping[str, Summary], path: Path) -> None:
+    from offbench.plots import figure, save
+
+    with open(ladder.folder / "ladder.csv", newline="", encoding="utf-8") as file:
+        rows = [{key: row[key] for key in ("step", "return", "deterministic_return")} for row in csv.DictReader(file)]
+    steps = [int(row["step"]) for row in rows]
+    with figure(2) as (fig, (left, right)):
+        for key, name, color in (("return", "sampled", BLUE), ("deterministic_return", "deterministic", "#9ab8d6")):
+            left.plot(steps, [float(row[key]) for row in rows], color=color, linewidth=1, label=name)
+        kept = ladder.rungs
+        left.plot([r.step for r in kept], [r.ret for r in kept], "o", markersize=4, color=RED, label="kept")
+        left.set(xlabel="environment steps", ylabel="return", title=f"SAC on {recipe.env_id}")
+        left.legend(frameon=False)
+        low = min(float(found.returns.min()) for found in levels.values())
+        high = max(float(found.returns.max()) for found in levels.values())
+        edges = np.linspace(low, high, BINS + 1)
+        for place, found in enumerate(levels.values()):
+            counts, _ = np.histogram(found.returns, edges)
+            # a square root, so that the few odd episodes are seen beside the many usual ones
+            right.stairs(place + 0.85 * np.sqrt(counts / counts.max()), edges, baseline=place, fill=True, color=BLUE)
+            right.plot([found.returns.mean()] * 2, [place, place + 0.85], color=RED, linewidth=1.2)
+        right.set_yticks(np.arange(len(levels)) + 0.3, list(levels))
+        right.set(xlabel="return", title="episodes by return (root scale; line: mean)")
+        save(fig, path)
