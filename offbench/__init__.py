@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from offbench.describe import inventory, show
     from offbench.launch import train
     from offbench.record import collect
+    from offbench.reporting import report
     from offbench.tables import normalize_runs_or_returns as normalize
     from offbench.transitions import load
 
@@ -35,6 +36,7 @@ __all__ = [
     "inventory",
     "load",
     "normalize",
+    "report",
     "show",
     "train",
 ]
@@ -47,6 +49,7 @@ _VERBS = {
     "inventory": ("offbench.describe", "inventory"),
     "load": ("offbench.transitions", "load"),
     "normalize": ("offbench.tables", "normalize_runs_or_returns"),
+    "report": ("offbench.reporting", "report"),
     "show": ("offbench.describe", "show"),
     "train": ("offbench.launch", "train"),
 }

@@ -14,6 +14,7 @@ COMMANDS = {
     "collect": "record a dataset: random, medium, medium-replay, medium-expert, expert, or a fraction",
     "train": "train an algorithm on a dataset, with evaluations as it goes",
     "normalize": "the score table of all runs, or the scores of given returns",
+    "report": "all runs as one page, with tables and figures as files",
     "evaluate": "play a run's policy, or a policy file",
     "behaviour": "train an environment's behaviour agent (SAC) and build its ladder",
     "list": "environments, levels, algorithms and local datasets",
@@ -215,6 +216,18 @@ def _normalize(parser: Parser, _: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
+def _report(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+    parser.add_argument("--out", default="report", metavar="DIR", help="where the report goes (default: report)")
+
+    def run(**arguments: Any) -> None:
+        from offbench.reporting import report
+
+        print(f"report in {report(**arguments)}")
+
+    parser.set_defaults(run=run)
+
+
 def _list(parser: Parser, _: list[str]) -> None:
     def run() -> None:
         from offbench.describe import inventory_lines
@@ -255,6 +268,7 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "collect": _collect,
     "train": _train,
     "normalize": _normalize,
+    "report": _report,
     "evaluate": _evaluate,
     "behaviour": _behaviour,
     "list": _list,
