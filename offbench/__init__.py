@@ -21,6 +21,7 @@ from offbench.errors import OffbenchError
 if TYPE_CHECKING:
     from offbench.agents import behaviour
     from offbench.assess import evaluate
+    from offbench.comparison import compare
     from offbench.describe import inventory, show
     from offbench.launch import train
     from offbench.record import collect
@@ -32,6 +33,7 @@ __all__ = [
     "OffbenchError",
     "behaviour",
     "collect",
+    "compare",
     "evaluate",
     "inventory",
     "load",
@@ -45,6 +47,7 @@ __all__ = [
 _VERBS = {
     "behaviour": ("offbench.agents", "behaviour"),
     "collect": ("offbench.record", "collect"),
+    "compare": ("offbench.comparison", "compare"),
     "evaluate": ("offbench.assess", "evaluate"),
     "inventory": ("offbench.describe", "inventory"),
     "load": ("offbench.transitions", "load"),

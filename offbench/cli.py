@@ -6,6 +6,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from json import dumps
 from typing import Any, NoReturn
 
 from offbench.errors import OffbenchError, unknown
@@ -15,6 +16,7 @@ COMMANDS = {
     "train": "train an algorithm on a dataset, with evaluations as it goes",
     "normalize": "the score table of all runs, or the scores of given returns",
     "report": "all runs as one page, with tables and figures as files",
+    "compare": "two methods over the datasets and seeds that both have, with a verdict",
     "evaluate": "play a run's policy, or a policy file",
     "behaviour": "train an environment's behaviour agent (SAC) and build its ladder",
     "list": "environments, levels, algorithms and local datasets",
@@ -228,6 +230,21 @@ def _report(parser: Parser, _: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
+def _compare(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("a", metavar="A", help="a group of runs: ALGO or ALGO/VARIANT, e.g. td3_bc")
+    parser.add_argument("b", metavar="B", help="the other one, e.g. bdb/beta=0.5")
+    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+    def run(json: bool, **arguments: Any) -> None:
+        from offbench.comparison import compare
+
+        found = compare(**arguments)
+        print(dumps(found.row(), indent=1) if json else "\n".join(found.lines()))
+
+    parser.set_defaults(run=run)
+
+
 def _list(parser: Parser, _: list[str]) -> None:
     def run() -> None:
         from offbench.describe import inventory_lines
@@ -269,6 +286,7 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "train": _train,
     "normalize": _normalize,
     "report": _report,
+    "compare": _compare,
     "evaluate": _evaluate,
     "behaviour": _behaviour,
     "list": _list,
