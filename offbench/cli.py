@@ -125,15 +125,15 @@ def _train(parser: Parser, words: list[str]) -> None:
     from offbench.settings import fields
 
     parser.add_argument("algorithm", metavar="ALGO", help=f"one of {', '.join(algorithm_names())}")
-    parser.add_argument(
-        "--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets of one environment"
-    )
+    parser.add_argument("--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets")
     parser.add_argument("--seeds", type=seed_list, default=[0], metavar="LIST", help="3, 0,1,2 or 0:5 (default: 0)")
     parser.add_argument("--steps", type=whole, default=1_000_000, help="updates (default: 1,000,000)")
     parser.add_argument("--eval-every", type=whole, default=5_000, help="updates between evaluations (default: 5,000)")
     parser.add_argument("--eval-episodes", type=whole, default=10, help="episodes of an evaluation (default: 10)")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
-    parser.add_argument("--workers", type=whole, help="evaluation processes (default: all cores but one)")
+    parser.add_argument("--workers", type=whole, help="processes for training and evaluation (default: one a core)")
+    parser.add_argument("--stack", type=auto, default="auto", help="most runs that train as one program (auto or N)")
+    parser.add_argument("--tf32", action="store_true", help="on a GPU: faster, less precise matrix products")
     parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
     positions = [word for before, word in zip(["", *words], words, strict=False) if not before.startswith("--")]
     algorithm = next((word for word in positions if not word.startswith("-")), None)
@@ -298,6 +298,11 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
 def whole(text: str) -> int:
     """Return a whole number from 1 (1e6 and 1_000_000 are understood)."""
     return _whole(text, 1)
+
+
+def auto(text: str) -> int | str:
+    """Return "auto" or a whole number from 1."""
+    return text if text == "auto" else whole(text)
 
 
 def natural(text: str) -> int:

@@ -1,27 +1,30 @@
-"""`train`: from an algorithm's name, datasets, settings and seeds to a stack of runs."""
+"""`train`: from an algorithm's name, datasets, settings and seeds to stacks of runs, and their jobs."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import operator
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 
 from offbench import checkpoints, transitions
+from offbench.batches import Member
+from offbench.devices import pick_device, stack_size
 from offbench.environments import checked_spec, same_environment
 from offbench.errors import OffbenchError, unknown
+from offbench.jobs import Job, Order, run_jobs
 from offbench.provenance import hardware, versions, warn_other_physics
 from offbench.recipes import d4rl_constants
 from offbench.registry import load_algorithm
 from offbench.runs import FORMAT, Run, run_folder, settings_dict, variant
 from offbench.settings import build, check, fields
-from offbench.training import Member, Schedule, Stack, Trainer
-from offbench.transitions import Transitions
+from offbench.stack import Stack
+from offbench.training import Schedule
 from offbench.workers import cores, default_workers
 
 
@@ -35,20 +38,25 @@ def train(
     eval_episodes: int = 10,
     device: str = "auto",
     workers: int | None = None,
+    stack: int | str = "auto",
+    tf32: bool = False,
     runs: str | Path = "runs",
     command: str = "",
     **settings: Any,
 ) -> list[Path]:
-    """Train runs of one algorithm as one stack, going on from their newest checkpoints.
+    """Train runs of one algorithm in stacks, going on from their newest checkpoints.
 
     Args:
         algorithm: a registered name: td3_bc, bdb, cql, or a third party's.
-        dataset: one id of a local Minari dataset, or several of one environment.
+        dataset: one id of a local Minari dataset, or several.
         seeds: one seed or several; each run's randomness depends on its own seed alone.
         steps: updates of each run.
         eval_every, eval_episodes: every so many updates, so many episodes of the deterministic policy.
         device: auto, cpu, cuda or cuda:N.
-        workers: evaluation processes beside the training (default: all cores but one).
+        workers: processes (default: one a core). Several runs on a CPU train in as many processes; one run, or a
+            GPU, has them for its evaluations.
+        stack: most runs that train as one program; "auto" follows the device's memory.
+        tf32: on a GPU, matrix products in TF32: faster, less precise; written into each run's config.json.
         runs: the folder of all run directories.
         command: what the user typed, for the run's config.json.
         settings: the algorithm's own (`offbench train bdb --help`); a setting that may differ between the runs
@@ -64,25 +72,107 @@ def train(
     configs = list(dict.fromkeys(kind.Config(**values) for values in _grid(kind.Config, settings, algorithm)))
     seed_list = _seed_list(seeds)
     _check_numbers(seed_list, steps, eval_every, eval_episodes)
+    names = [dataset] if isinstance(dataset, str) else list(dict.fromkeys(dataset))
+    if not names:
+        raise OffbenchError("give at least one dataset")
+    orders = [
+        Order(
+            algorithm,
+            name,
+            settings_dict(config),
+            seed,
+            str(run_folder(Path(runs), name, algorithm, variant(config), seed)),
+        )
+        for name, config, seed in itertools.product(names, configs, seed_list)
+    ]
     place = pick_device(device)
-    datasets = [transitions.load(name) for name in ([dataset] if isinstance(dataset, str) else dict.fromkeys(dataset))]
-    _check_environment(datasets)
-    schedule = Schedule(
-        steps, eval_every, eval_episodes, place, max(1, cores() - 1) if workers is None else default_workers(workers)
-    )
-    members = []
-    for data, config, seed in itertools.product(datasets, configs, seed_list):
+    processes = default_workers(workers) if place == "cpu" else 1
+    schedule = Schedule(steps, eval_every, eval_episodes, place, workers=0)
+    jobs = jobs_of(orders, schedule, processes, stack=stack, tf32=tf32, command=command)
+    if place != "cpu":
+        jobs = with_evaluators(jobs, default_workers(workers))
+    elif len(jobs) == 1:
+        jobs = with_evaluators(jobs, max(1, cores() - 1) if workers is None else workers)
+    problems = [
+        f"{order.folder} has diverged before and is left as it is; delete it to try again"
+        for order in orders
+        if Run(Path(order.folder)).diverged
+    ]
+    problems += run_jobs(jobs, processes) if jobs else []
+    if problems:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise OffbenchError(problems[0] + more)
+    return [Path(order.folder) for order in orders]
+
+
+def jobs_of(
+    orders: Sequence[Order],
+    schedule: Schedule,
+    processes: int,
+    *,
+    stack: int | str = "auto",
+    tf32: bool = False,
+    command: str = "",
+) -> list[Job]:
+    """Claim the runs' directories and sort what is left to train into jobs.
+
+    Runs train together if they share the algorithm, every setting that is not `per_run`, the environment and the
+    step they stand at; large stacks are cut to the device's size, and so that no process is idle.
+
+    Raises:
+        OffbenchError: a dataset is missing or damaged, or another run lives in a run's directory.
+    """
+    if stack != "auto" and not (isinstance(stack, int) and stack >= 1):
+        raise OffbenchError(f"stack must be auto or a whole number from 1, not {stack!r}")
+    loaded = {name: transitions.load(name) for name in dict.fromkeys(order.dataset for order in orders)}
+    for data in loaded.values():
+        if data.env_spec:
+            checked_spec(data.env_spec, data.dataset_id, data.observations.shape[1], data.actions.shape[1])
         warn_other_physics(data.dataset_id, data.metadata.get("offbench", {}).get("versions", {}))
-        run = Run(run_folder(Path(runs), data.dataset_id, algorithm, variant(config), seed))
-        members.append(Member(run, seed, config, data, references(data)))
-    for member in members:
-        member.run.claim(_config(algorithm, member, schedule, command))
-    with _threads(place):
-        for group in together(members, steps):
-            title = f"{algorithm} on {group[0].data.dataset_id}"
-            title += f" ({len(group)} runs)" if len(group) > 1 else ""
-            Trainer(kind, group, schedule, title).train()
-    return [member.run.folder for member in members]
+    paired = [(order, order.member(loaded[order.dataset])) for order in orders]
+    for order, member in paired:
+        member.run.claim(_config(order.algorithm, member, schedule, tf32, command))
+    order_of = {member.run.folder: order for order, member in paired}
+    # cut before looking at what is left: a stack that resumes has the same runs, so the same bits, as before
+    groups = _alike(paired)
+    jobs = []
+    for group in groups:
+        size = stack
+        if isinstance(size, str):
+            algorithm = load_algorithm(order_of[group[0].run.folder].algorithm)
+            size = stack_size(algorithm, group[0], schedule.device)
+        share = max(1, processes // len(groups))  # of the processes
+        parts = min(len(group), -(-len(group) // size // share) * share)
+        for part in np.array_split(np.arange(len(group)), parts):
+            left = [group[i] for i in part if not group[i].run.diverged]
+            for stage in together(left, schedule.steps):
+                jobs.append(Job(tuple(order_of[member.run.folder] for member in stage), schedule, tf32))
+    return jobs
+
+
+def with_evaluators(jobs: Sequence[Job], workers: int) -> list[Job]:
+    """Give each job evaluation processes of its own."""
+    return [
+        dataclasses.replace(job, schedule=dataclasses.replace(job.schedule, workers=default_workers(workers)))
+        for job in jobs
+    ]
+
+
+def _alike(paired: Sequence[tuple[Order, Member]]) -> list[list[Member]]:
+    """Sort runs by algorithm, environment, and the settings that cannot differ within a stack."""
+    kinds: list[tuple[Any, Member, list[Member]]] = []
+    for order, member in paired:
+        per_run = {name for name, field in fields(type(member.config)).items() if field.metadata.get("per_run")}
+        shared = {name: value for name, value in settings_dict(member.config).items() if name not in per_run}
+        shapes = member.data.observations.shape[1], member.data.actions.shape[1]
+        key = (order.algorithm, shared, shapes)
+        for known, first, group in kinds:
+            if known == key and same_environment(first.data.env_spec, member.data.env_spec):
+                group.append(member)
+                break
+        else:
+            kinds.append((key, member, [member]))
+    return [group for _, _, group in kinds]
 
 
 def together(members: Sequence[Member], steps: int) -> list[list[Member]]:
@@ -122,28 +212,6 @@ def _seed_list(seeds: int | Sequence[int]) -> list[int]:
         raise OffbenchError(f"seeds must be whole numbers, not {seeds!r}") from None
 
 
-def _check_environment(datasets: Sequence[Transitions]) -> None:
-    """Refuse datasets of different environments, and one whose environment cannot be played."""
-    if not datasets:
-        raise OffbenchError("give at least one dataset")
-    first = datasets[0]
-    for data in datasets[1:]:
-        if (
-            data.observations.shape[1:] != first.observations.shape[1:]
-            or data.actions.shape[1:] != first.actions.shape[1:]
-        ):
-            raise OffbenchError(
-                f"datasets of one stack must have the same shapes: {first.dataset_id}, {data.dataset_id}"
-            )
-        if not same_environment(data.env_spec, first.env_spec):
-            raise OffbenchError(
-                f"datasets of one stack must be of one environment; {first.dataset_id} and {data.dataset_id} are not: "
-                "train them apart"
-            )
-    if first.env_spec:
-        checked_spec(first.env_spec, first.dataset_id, first.observations.shape[1], first.actions.shape[1])
-
-
 def _grid(cls: type, settings: Mapping[str, Any], algorithm: str) -> Iterator[dict[str, Any]]:
     """Yield the settings of each config: the product of all lists given."""
     known, columns = fields(cls), []
@@ -167,25 +235,6 @@ def _check_numbers(seeds: Sequence[int], steps: int, eval_every: int, eval_episo
             raise OffbenchError(f"{name} must be a whole number from 1, not {value}")
 
 
-def pick_device(device: str) -> str:
-    """Return the device to train on: `auto` takes a GPU if there is one.
-
-    Raises:
-        OffbenchError: not a device, or one that this machine lacks.
-    """
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    kind, _, index = device.partition(":")
-    if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
-        raise OffbenchError(f"device must be auto, cpu, cuda or cuda:N, not {device!r}")
-    if kind == "cuda" and (not torch.cuda.is_available() or int(index or 0) >= torch.cuda.device_count()):
-        found = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        raise OffbenchError(
-            f"no device {device}: PyTorch {torch.__version__} sees {found} GPUs here; use --device cpu"
-        )
-    return device
-
-
 def restore(run: Run) -> Stack:
     """Return a run's learning state from its newest checkpoint, on the CPU.
 
@@ -202,21 +251,13 @@ def restore(run: Run) -> Stack:
     if found is None:
         raise OffbenchError(f"{run.folder} has no checkpoint yet; train it to its first one")
     tensors, state = found
-    stack = Stack(kind, [Member(run, config["seed"], settings, data, references(data))], "cpu")
+    stack = Stack(kind, [Member(run, config["seed"], settings, data, data.references)], "cpu")
     stack.load(0, tensors)
     stack.step = int(state["step"])
     return stack
 
 
-def references(data: Transitions) -> tuple[float, float] | None:
-    """Return a dataset's own reference scores (random, expert), None if it has none."""
-    low, high = data.metadata.get("ref_min_score"), data.metadata.get("ref_max_score")
-    if low is None or high is None or not float(high) > float(low):
-        return None
-    return float(low), float(high)
-
-
-def _config(algorithm: str, member: Member, schedule: Schedule, command: str) -> dict[str, Any]:
+def _config(algorithm: str, member: Member, schedule: Schedule, tf32: bool, command: str) -> dict[str, Any]:
     """Return the run's config.json: all that is needed to repeat it, and to score it without its dataset."""
     data = member.data
     constants = d4rl_constants(data.env_id)
@@ -238,19 +279,8 @@ def _config(algorithm: str, member: Member, schedule: Schedule, command: str) ->
         "env_id": data.env_id,
         "env_spec": data.env_spec,
         "device": schedule.device,
+        "tf32": tf32,
         "command": command,
         "versions": versions(),
         **hardware(),
     }
-
-
-@contextmanager
-def _threads(device: str) -> Iterator[None]:
-    """Train on one thread: two runs in two processes beat one run on two threads."""
-    before = torch.get_num_threads()
-    if device == "cpu":
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import warnings
 from pathlib import Path
 from typing import Any
@@ -188,25 +187,6 @@ def test_a_full_disk_is_seen_before_recording(
     assert "not enough room" in line
     assert "MINARI_DATASETS_PATH" in line
     assert dataset.local_ids() == []
-
-
-def test_datasets_of_different_shapes_do_not_stack(medium: str) -> None:
-    foreign("other-v0", [episode(3, 0, True)])
-    with pytest.raises(offbench.OffbenchError, match="one stack must have the same shapes"):
-        offbench.train("td3_bc", [medium, "other-v0"], steps=10, hidden=(8,))
-
-
-def test_datasets_of_different_environments_do_not_stack(tiny: tuple[str, str], medium: str, home: Path) -> None:
-    """The same shapes, another time limit: evaluations and references would be mixed up."""
-    path = home / "minari" / medium / "data" / "metadata.json"
-    shutil.copytree(home / "minari" / medium, home / "minari" / "longer-v0")
-    metadata = json.loads(path.read_text())
-    spec = json.loads(metadata["eval_env_spec"]) | {"max_episode_steps": 500}
-    changed = metadata | {"eval_env_spec": json.dumps(spec), "dataset_id": "longer-v0"}
-    (home / "minari" / "longer-v0" / "data" / "metadata.json").write_text(json.dumps(changed))
-    with pytest.raises(offbench.OffbenchError, match="must be of one environment"):
-        offbench.train("td3_bc", [medium, "longer-v0"], steps=10, hidden=(8,))
-    assert not list(home.glob("runs/**/config.json"))
 
 
 @pytest.mark.parametrize(
