@@ -135,6 +135,8 @@ def _train(parser: Parser, words: list[str]) -> None:
     parser.add_argument("--stack", type=auto, default="auto", help="most runs that train as one program (auto or N)")
     parser.add_argument("--tf32", action="store_true", help="on a GPU: faster, less precise matrix products")
     parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+    parser.add_argument("--tensorboard", action="store_true", help="write event files beside each run")
+    parser.add_argument("--wandb", metavar="PROJECT", help="show the runs in a Weights & Biases project")
     positions = [word for before, word in zip(["", *words], words, strict=False) if not before.startswith("--")]
     algorithm = next((word for word in positions if not word.startswith("-")), None)
     if algorithm is None:

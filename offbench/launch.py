@@ -18,6 +18,7 @@ from offbench.devices import pick_device, stack_size
 from offbench.environments import checked_spec, same_environment
 from offbench.errors import OffbenchError, unknown
 from offbench.jobs import Job, Order, run_jobs
+from offbench.loggers import Destinations
 from offbench.provenance import hardware, versions, warn_other_physics
 from offbench.recipes import d4rl_constants
 from offbench.registry import load_algorithm
@@ -41,6 +42,8 @@ def train(
     stack: int | str = "auto",
     tf32: bool = False,
     runs: str | Path = "runs",
+    tensorboard: bool = False,
+    wandb: str | None = None,
     command: str = "",
     **settings: Any,
 ) -> list[Path]:
@@ -58,6 +61,8 @@ def train(
         stack: most runs that train as one program; "auto" follows the device's memory.
         tf32: on a GPU, matrix products in TF32: faster, less precise; written into each run's config.json.
         runs: the folder of all run directories.
+        tensorboard: write TensorBoard event files into each run's folder `tensorboard`.
+        wandb: a Weights & Biases project to show the runs in.
         command: what the user typed, for the run's config.json.
         settings: the algorithm's own (`offbench train bdb --help`); a setting that may differ between the runs
             of a stack also takes a list, e.g. `beta=[0.25, 0.5, "adaptive"]`.
@@ -85,9 +90,11 @@ def train(
         )
         for name, config, seed in itertools.product(names, configs, seed_list)
     ]
+    show = Destinations(tensorboard, wandb)
+    show.check()
     place = pick_device(device)
     processes = default_workers(workers) if place == "cpu" else 1
-    schedule = Schedule(steps, eval_every, eval_episodes, place, workers=0)
+    schedule = Schedule(steps, eval_every, eval_episodes, place, workers=0, show=show)
     jobs = jobs_of(orders, schedule, processes, stack=stack, tf32=tf32, command=command)
     if place != "cpu":
         jobs = with_evaluators(jobs, default_workers(workers))

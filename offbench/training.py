@@ -21,6 +21,7 @@ from offbench.algorithm import Algorithm
 from offbench.batches import Member
 from offbench.errors import OffbenchError
 from offbench.files import disk_errors
+from offbench.loggers import NOWHERE, Destinations, Loggers
 from offbench.rollout import Outcome, Rollouts, result
 from offbench.runs import Run
 from offbench.scores import normalize
@@ -44,6 +45,7 @@ class Schedule:
         device: PyTorch's name of it.
         workers: evaluation processes; 0 evaluates in this process.
         deadline: time.time() after which the stack stops at its next chunk, None for never.
+        show: live views of the training, none by default.
     """
 
     steps: int
@@ -52,6 +54,7 @@ class Schedule:
     device: str
     workers: int
     deadline: float | None = None
+    show: Destinations = NOWHERE
 
 
 class Trainer:
@@ -60,6 +63,7 @@ class Trainer:
     def __init__(self, kind: type[Algorithm], members: Sequence[Member], schedule: Schedule) -> None:
         self.members, self.schedule = list(members), schedule
         self.stack = Stack(kind, members, schedule.device)
+        self.loggers = Loggers([member.run for member in members], schedule.show)
         self.evaluations: list[dict[int, list[tuple[float, int]]]] = [{} for _ in members]
         self.losses: list[list[dict[str, float]]] = [[] for _ in members]
         self.pending: list[tuple[int, int, Future[list[Outcome]]]] = []  # (run, step, outcomes)
@@ -78,6 +82,7 @@ class Trainer:
             for member in self.members:
                 resources.enter_context(held(member.run))
             self._resume()
+            resources.enter_context(self.loggers)
             spec = self.members[0].data.env_spec  # datasets of one stack are of one environment
             if spec:
                 self.rollouts = resources.enter_context(Rollouts(spec, self.schedule.workers))
@@ -95,6 +100,7 @@ class Trainer:
                 if self._evaluates_at(self.stack.step):
                     self._evaluate()
             self._collect()
+            self._show()
             report(self.stack.step, self.note)
         return list(self.lost.values())
 
@@ -165,8 +171,14 @@ class Trainer:
                 self.stack.policy(run).save(member.run.policy_path)
                 checkpoints.save_checkpoint(folder, step, slice_of(tensors, run), {"step": step})
                 checkpoints.keep_newest(folder)
+        self._show()
         self._saved = time.monotonic()
         self._took = self._saved - began
+
+    def _show(self) -> None:
+        """Send what the last checkpoint keeps to the live views."""
+        for run, _ in self._going():
+            self.loggers.write(run, self.losses[run], self.evaluations[run])
 
     def _evaluate(self) -> None:
         """Start the evaluation of every run's policy as it is now, unless it is known already."""
