@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import offbench
-from offbench import reporting
+from offbench import assess, reporting
 from offbench.cli import main
 from offbench.files import write_json
 from offbench.report_figures import shortened
@@ -206,6 +206,34 @@ def test_a_run_that_is_there_twice_is_refused(home: Path) -> None:
     with pytest.raises(offbench.OffbenchError, match="the same run twice"):
         offbench.report(home / "runs", home / "out")
     assert not (home / "out").exists()
+
+
+def test_a_real_training(medium: str, home: Path) -> None:
+    """Whatever the training writes is understood: settings, losses, evaluations, the similar score."""
+    sizes = {"steps": 40, "eval_every": 20, "eval_episodes": 2, "hidden": (8,), "batch_size": 8, "workers": 1}
+    folders = offbench.train("bdb", medium, seeds=range(2), beta=[0.25, "adaptive"], **sizes)
+    folders += offbench.train("td3_bc", medium, **sizes)
+    for folder in folders:
+        assess.similarity(folder, samples=256)
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert {"scores", "improvement", "similarity", "beta", "critic"} <= set(page.ids)
+    ((row),) = rows(home / "out" / "tables" / "scores.csv")
+    assert (row["level"], row["environment"]) == ("medium", "tiny")
+    assert any(name.startswith("bdb beta=adaptive,") for name in row)
+    (found,) = [
+        r for r in rows(home / "out" / "tables" / "similarity-details.csv") if r["method"].startswith("td3_bc")
+    ]
+    written = json.loads((folders[-1] / "similarity.json").read_text())
+    assert found["by Q (%)"] == f"{written['q_similar']:.1f} ± ?"
+
+
+def test_a_file_where_the_report_should_be(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    (home / "taken").touch()
+    with pytest.raises(SystemExit) as stopped:
+        main(["report", "--out", "taken"])
+    assert stopped.value.code == 2
+    assert "taken is a file" in capsys.readouterr().err
 
 
 def test_damaged_similarity_is_said(home: Path) -> None:
