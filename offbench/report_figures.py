@@ -27,6 +27,15 @@ PROFILE_POINTS = 121
 
 
 @dataclass(frozen=True)
+class Line:
+    """How one method is drawn everywhere."""
+
+    label: str
+    color: str
+    style: Any
+
+
+@dataclass(frozen=True)
 class Figure:
     """A figure as its files and as part of the page.
 
@@ -34,6 +43,7 @@ class Figure:
         name: the stem of its files.
         caption: what it shows.
         alt: the same for those who cannot see it, with its main numbers.
+        lines: what a legend must tell.
     """
 
     name: str
@@ -42,15 +52,7 @@ class Figure:
     png: bytes
     svg: bytes
     inline: str
-
-
-@dataclass(frozen=True)
-class Line:
-    """How one method is drawn everywhere."""
-
-    label: str
-    color: str
-    style: Any
+    lines: tuple[Line, ...]
 
 
 def lines(methods: Sequence[Method]) -> dict[Method, Line]:
@@ -131,13 +133,13 @@ def profile_figure(found: Mapping[Method, tuple[Estimate, Scores]], looks: Mappi
 
 
 def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure:
-    """Draw the IQM over all tasks against the updates, at the steps that all of a method's runs share."""
+    """Draw the IQM over all tasks against the updates, of the methods that have all tasks, where their runs meet."""
+    tasks = {task for task in results.tasks if task.reference}
+    whole = [method for method in results.methods if tasks <= {entry.task for entry in results.of(method)}]
 
     def paint(axes: Any) -> None:
-        for method in results.methods:
+        for method in whole:
             curves = {e.task.name: e.common_curve() for e in results.of(method) if e.task.reference}
-            if not curves:
-                continue
             steps = sorted(set.intersection(*(set(found[0]) for found in curves.values())))
             shown = steps[:: max(1, len(steps) // 40)]
             points = [iqm({t: v[:, s.index(step)].tolist() for t, (s, v) in curves.items()}, 2000) for step in shown]
@@ -145,8 +147,9 @@ def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure:
                 _band(axes, shown, points, looks[method])
         axes.set(xlabel="updates", ylabel="IQM of normalised scores", title="all tasks")
 
-    caption = "Interquartile mean over all tasks at each evaluation, 95% interval shaded."
-    return _draw("curves-iqm", caption, "Learning curves of the interquartile mean.", paint, list(looks.values()))
+    caption = "Interquartile mean over all tasks, 95% interval shaded; methods that have all tasks."
+    alt = f"Learning curves of the interquartile mean over all tasks: {', '.join(m.label for m in whole)}."
+    return _draw("curves-iqm", caption, alt, paint, [looks[method] for method in whole])
 
 
 def loss_figure(
@@ -166,6 +169,8 @@ def loss_figure(
             mean, low, high = values.mean(0), values.min(0), values.max(0)
             points = [Estimate(*map(float, row)) for row in zip(mean, low, high, strict=True)]
             _band(axes, steps, points, looks[method])
+        if column == "beta":
+            axes.set_ylim(-0.03, 1.03)
         axes.set(xlabel="updates", ylabel=label, title=shortened(task.name, 44))
 
     alt = f"{label} over training on {task.name}. At the end: {', '.join(ends)}."
@@ -192,9 +197,17 @@ def _band(axes: Any, x: Sequence[float], points: Sequence[Estimate], look: Line)
 
 
 def _named_rows(axes: Any, names: Sequence[str]) -> None:
-    axes.set_yticks(range(len(names)), [shortened(name, 24) for name in names])
+    axes.set_yticks(range(len(names)), [_two_lines(name) for name in names])
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
+
+
+def _two_lines(name: str) -> str:
+    """Return a long name on two lines, the first setting on the first."""
+    if len(name) <= 24:
+        return name
+    head, comma, tail = name.partition(",")
+    return f"{shortened(head + comma, 24)}\n{shortened(tail, 24)}".rstrip()
 
 
 def shortened(text: str, most: int) -> str:
@@ -243,7 +256,7 @@ def _draw(
             fig.set_size_inches(SIZE[0], SIZE[1] + 0.2 * ((len(legend) + 1) // 2))
             fig.legend(handles, names, loc="outside lower center", ncols=2, frameon=False, fontsize="small")
         png, svg = _saved(fig, "png"), _saved(fig, "svg")
-    return Figure(name, caption, alt() if callable(alt) else alt, png, svg, _for_page(inline, name))
+    return Figure(name, caption, alt() if callable(alt) else alt, png, svg, _for_page(inline, name), tuple(legend))
 
 
 def _saved(fig: Any, kind: str) -> bytes:

@@ -107,8 +107,9 @@ def _cell(found: Table, column: int, cell: Cell) -> Markup:
     return tag("td", text, class_="number best" if cell.best else "number", data_value=value)
 
 
-def figures(found: Sequence[Figure], looks: Sequence[Line] = ()) -> Markup:
-    """Return figures in a grid below one legend."""
+def figures(found: Sequence[Figure]) -> Markup:
+    """Return figures in a grid below one legend of all their lines."""
+    looks = dict.fromkeys(look for figure in found for look in figure.lines)
     parts = []
     for figure in found:
         files = [

@@ -133,15 +133,14 @@ def _lead(results: Results) -> Markup:
 def _sections(
     results: Results, found: Mapping[str, Table], pictures: Mapping[str, Sequence[Figure]]
 ) -> Iterator[Section]:
-    looks = list(draw.lines(results.methods).values())
     words = "Click a number to see where it comes from: seeds, commands, versions, hardware. Click a header to sort."
     yield Section("scores", "Table 1: scores", [table(found["scores"])], words)
     if "iqm" in found:
-        parts = [figures(pictures["iqm"], looks), table(found["iqm"])]
+        parts = [figures(pictures["iqm"]), table(found["iqm"])]
         yield Section("aggregate", "Across datasets", parts)
     if "improvement" in found:
         yield Section("improvement", "Probability of improvement", [table(found["improvement"])])
-    yield Section("curves", "Figure 4: learning curves", [figures(pictures["curves"], looks)])
+    yield Section("curves", "Figure 4: learning curves", [figures(pictures["curves"])])
     yield Section("finals", "Final scores, seed by seed", [figures(pictures["finals"])])
     if "beside" in found:
         yield Section("beside", "Beside published numbers", [table(found["beside"])])
@@ -150,12 +149,12 @@ def _sections(
         yield Section("similarity", "Table 2: similar score", [table(found["similarity"]), more])
     if pictures["beta"]:
         words = "BDB's weight of the discriminator against cloning: 0 is TD3+BC, 1 the discriminator alone."
-        yield Section("beta", "Beta over training", [figures(pictures["beta"], looks)], words)
+        yield Section("beta", "Beta over training", [figures(pictures["beta"])], words)
     if pictures["q"]:
         words = (
             "Mean |Q1| on the dataset's own actions. A critic that diverges is seen here before the score shows it."
         )
-        yield Section("critic", "Critic over training", [figures(pictures["q"], looks)], words)
+        yield Section("critic", "Critic over training", [figures(pictures["q"])], words)
     cards = [_card(env) for env in dict.fromkeys(task.place[0] for task in results.tasks)]
     if any(cards):
         yield Section("datasets", "Datasets", [card for card in cards if card], "As shipped with the package.")

@@ -54,7 +54,7 @@ class Task:
     def place(self) -> tuple[str, str]:
         """(environment, level) by the dataset's id; the level is empty where the id has none."""
         stem = re.sub(r"-v\d+$", "", self.dataset)
-        found = re.fullmatch(rf"(.+)[-/]({'|'.join(sorted(LEVELS, key=len, reverse=True))}|\d+percent)", stem)
+        found = re.fullmatch(rf"(.+?)[-/]({'|'.join(sorted(LEVELS, key=len, reverse=True))}|\d+percent)", stem)
         return (found[1].split("/")[-1], found[2]) if found else (stem, "")
 
 

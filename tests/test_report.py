@@ -137,6 +137,8 @@ def test_tasks_and_methods_in_the_papers_order(home: Path) -> None:
     ("dataset", "place"),
     [
         ("hopper-medium-replay-v0", ("hopper", "medium-replay")),
+        ("hopper-medium-expert-v0", ("hopper", "medium-expert")),
+        ("mujoco/walker2d/medium-expert-v0", ("walker2d", "medium-expert")),
         ("inverted-pendulum-medium-v3", ("inverted-pendulum", "medium")),
         ("hopper-60percent-v0", ("hopper", "60percent")),
         ("mujoco/hopper/expert-v0", ("hopper", "expert")),
