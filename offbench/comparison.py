@@ -38,7 +38,7 @@ class Comparison:
         chance: probability that a run of A scores above one of B, over the paired runs.
         unpaired: how many runs of either have no partner and are left out.
         steps: how far A's and B's paired runs have been evaluated.
-        unfinished: how many of the paired runs have not reached their end.
+        unfinished: how many of the paired runs have not reached their last step, or have diverged.
     """
 
     a: str
@@ -85,7 +85,7 @@ class Comparison:
             told = [" to ".join(f"{step:,}" for step in dict.fromkeys((s[0], s[-1]))) for s in self.steps]
             lines.append(f"note: not the same training: {self.a} {told[0]} steps, {self.b} {told[1]}")
         if self.unfinished:
-            lines.append(f"note: {self.unfinished} of the paired runs are unfinished")
+            lines.append(f"note: {self.unfinished} of the paired runs did not reach their last step")
         if self.unpaired:
             lines.append(f"note: {self.unpaired} runs have no partner of the same dataset and seed and are left out")
         return [*lines, "", self.verdict]
@@ -149,7 +149,7 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
         improvement(_by_dataset(pairs, lambda pair: pair.a), _by_dataset(pairs, lambda pair: pair.b)),
         len(left) + len(right) - 2 * len(both),
         tuple(sorted({t.reached for t in side}) for side in trained),
-        sum(t.reached < t.steps for side in trained for t in side),
+        sum(t.state != "finished" for side in trained for t in side),
     )
 
 

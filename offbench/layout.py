@@ -16,6 +16,7 @@ SPECIAL = {
     "±": r"$\pm$",
     "β": r"$\beta$",
     "†": r"$\dagger$",
+    "‡": r"$\ddagger$",
     "<": r"\textless{}",
     ">": r"\textgreater{}",
     "|": r"\textbar{}",

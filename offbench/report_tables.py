@@ -87,7 +87,8 @@ def column_steps(entries: Sequence[Entry]) -> str:
 
 def _score_cell(entry: Entry, below: str, detail: str, more: str) -> Cell:
     found = mean_std(entry.scores)
-    text = plus_minus(found) + ("" if entry.finished else " †")
+    marks = [mark for state, mark in (("unfinished", " †"), ("diverged", " ‡")) if state in entry.states]
+    text = plus_minus(found) + "".join(marks)
     return Cell(text if entry.task.reference else f"return {text}", found[0], below, detail=detail, more=more)
 
 
@@ -113,7 +114,10 @@ def _score_notes(results: Results, seeds: set[int]) -> list[str]:
         f"{LAST} evaluations, never its best ({last} of them here). {scale(results)} Best mean of a row in bold.",
         f"“paper”: {PAPER} (5 seeds, 1M steps). {DIFFERENT_DATA}",
     ]
-    if not all(entry.finished for entry in entries):
+    states = set().union(*(entry.states for entry in entries))
+    if "diverged" in states:
+        notes.insert(1, "‡ a run became NaN or infinite and stopped: the number is of its evaluations before that.")
+    if "unfinished" in states:
         notes.insert(1, "† training is not finished: the number is of the steps done so far and may still change.")
     if any(task.twin for task in results.tasks):
         notes.append(
@@ -225,7 +229,6 @@ def seed_table(results: Results) -> Table:
     for entry in _in_order(results):
         for trained in entry.runs:
             score, ret = trained.score(entry.task.reference), trained.score(None)
-            done = trained.reached >= trained.steps
             rows.append(
                 [
                     Cell(entry.task.name),
@@ -237,7 +240,7 @@ def seed_table(results: Results) -> Table:
                     Cell(str(min(len(trained.evaluations), LAST)), min(len(trained.evaluations), LAST)),
                     Cell(f"{trained.reached:,}", trained.reached),
                     Cell(f"{trained.steps:,}", trained.steps),
-                    Cell("finished" if done else "unfinished"),
+                    Cell(trained.state),
                 ]
             )
     for run in results.waiting:
@@ -252,7 +255,7 @@ def seed_table(results: Results) -> Table:
             Cell("0", 0),
             Cell(f"{config['steps']:,}"),
         ]
-        rows.append([*map(Cell, words), *numbers, Cell("not evaluated yet")])
+        rows.append([*map(Cell, words), *numbers, Cell("diverged" if run.diverged else "not evaluated yet")])
     header = ["dataset", "method", "seed", "score", "return", "reference", "evaluations", "step", "of", "state"]
     return Table("seeds", "Every run", header, rows, [], 3)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import base64
 import importlib.resources
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,8 @@ from offbench.report_similarity import similarity_tables
 from offbench.report_tables import scale
 from offbench.results import Entry, Method, Results, read_results
 
-MARK = "index.html"
+PAGE = "index.html"
+STATES = {"unfinished": "are unfinished", "diverged": "diverged"}
 
 
 def report(runs: str | Path = "runs", out: str | Path = "report") -> Path:
@@ -56,8 +58,8 @@ def report(runs: str | Path = "runs", out: str | Path = "report") -> Path:
         write_bytes(folder / "figures" / f"{figure.name}.png", figure.png)
         write_bytes(folder / "figures" / f"{figure.name}.svg", figure.svg)
     content = page("Offline RL benchmark", _lead(results), list(_sections(results, found, pictures)), boxes(results))
-    write_bytes(folder / MARK, content)  # last: a page's links all lead somewhere
-    return folder / MARK
+    write_bytes(folder / PAGE, content)  # last: a page's links all lead somewhere
+    return folder / PAGE
 
 
 def _tables(results: Results) -> dict[str, Table]:
@@ -112,7 +114,7 @@ def _lead(results: Results) -> Markup:
     entries = list(results.entries.values())
     runs = [trained for entry in entries for trained in entry.runs]
     seeds = sorted({len(entry.runs) for entry in entries})
-    done = sum(trained.reached >= trained.steps for trained in runs)
+    states = Counter(trained.state for trained in runs)
     counts = {
         "runs": f"{len(runs)}",
         "datasets": f"{len(results.tasks)}",
@@ -121,9 +123,8 @@ def _lead(results: Results) -> Markup:
         "updates trained": f"{sum(trained.reached for trained in runs):,}",
     }
     tiles = [tag("li", tag("b", value), tag("span", name)) for name, value in counts.items()]
-    state = (
-        "All runs are finished." if done == len(runs) else f"{len(runs) - done} of {len(runs)} runs are unfinished."
-    )
+    told = [f"{states[name]} of {len(runs)} runs {verb}." for name, verb in STATES.items() if states[name]]
+    state = " ".join(told) or "All runs are finished."
     if results.waiting:
         state += f" {len(results.waiting)} more have not been evaluated yet."
     words = f"{scale(results)} {state}"

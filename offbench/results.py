@@ -107,6 +107,13 @@ class Trained:
         """How far the run is to go."""
         return int(self.config["steps"])
 
+    @property
+    def state(self) -> str:
+        """`finished`, `unfinished` or `diverged`."""
+        if self.run.diverged:
+            return "diverged"
+        return "finished" if self.reached >= self.steps else "unfinished"
+
     def score(self, reference: str | None) -> float:
         """Return the run's score by a reference that it has (None: its return)."""
         return self._normalized(run_return(self.evaluations), reference)
@@ -150,9 +157,9 @@ class Entry:
         return max(trained.steps for trained in self.runs)
 
     @property
-    def finished(self) -> bool:
-        """Whether every run has been evaluated at its end."""
-        return all(trained.reached >= trained.steps for trained in self.runs)
+    def states(self) -> set[str]:
+        """How far the runs are: `finished`, `unfinished`, `diverged`."""
+        return {trained.state for trained in self.runs}
 
     @property
     def evaluations(self) -> int:

@@ -75,7 +75,7 @@ def test_unequal_training_is_said(home: Path) -> None:
         run.write_evaluations({3000: [(40.0, 5)]})
     text = "\n".join(offbench.compare("td3_bc", "cql").lines())
     assert "note: not the same training: td3_bc 30,000 steps, cql 3,000" in text
-    assert "note: 2 of the paired runs are unfinished" in text
+    assert "note: 2 of the paired runs did not reach their last step" in text
 
 
 def test_an_algorithm_alone_is_its_default_or_only_variant(home: Path) -> None:

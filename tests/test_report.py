@@ -192,6 +192,18 @@ def test_unfinished_and_unbegun_runs_are_marked(home: Path) -> None:
     assert states == {"td3_bc": "unfinished", "cql": "not evaluated yet"}
 
 
+def test_a_diverged_run_is_marked(home: Path) -> None:
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, reached=10_000)
+    run.mark_diverged(12_000, "critic.0")
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert "1 of 1 runs diverged." in page.text
+    assert "became NaN or infinite" in page.text
+    ((row),) = rows(home / "out" / "tables" / "scores.csv")
+    assert row["td3_bc (10,000 of 30,000 steps)"].endswith("± ? ‡")
+    ((row),) = rows(home / "out" / "tables" / "seeds.csv")
+    assert row["state"] == "diverged"
+
+
 def test_a_dataset_recorded_twice_is_two_rows(home: Path) -> None:
     made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
     run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 1, 50)
