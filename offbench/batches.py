@@ -28,13 +28,19 @@ CHUNK = 100  # updates whose random numbers are drawn together; part of what a s
 
 @dataclass(frozen=True)
 class Member:
-    """One run of a stack."""
+    """One run of a stack.
+
+    Attributes:
+        algorithm: its name in the registry.
+        guest: it is a special case of the algorithm whose stack this is (TD3+BC in one of BDB).
+    """
 
     run: Run
     seed: int
     config: Any
     data: Transitions
-    references: tuple[float, float] | None
+    algorithm: str
+    guest: bool = False
 
 
 class Store:

@@ -101,6 +101,23 @@ class ContentHash:
         return self._hash.hexdigest()
 
 
+def being_recorded(dataset_id: str) -> bool:
+    """Whether another process holds a dataset id for writing."""
+    path = path_of(dataset_id)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(_lock_path(path))
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        return True
+    lock.release()
+    return False
+
+
+def _lock_path(path: Path) -> Path:
+    return path.parent / f".offbench-{path.name}.lock"
+
+
 @contextlib.contextmanager
 def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     """Hold a dataset id for writing; yields its folder.
@@ -112,7 +129,7 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     path = path_of(dataset_id)
     with disk_errors(str(path)):
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(path.parent / f".offbench-{path.name}.lock")
+        lock = FileLock(_lock_path(path))
         try:
             lock.acquire(timeout=0)
         except Timeout:

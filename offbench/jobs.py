@@ -47,17 +47,32 @@ class Order:
     seed: int
     folder: str
 
-    def member(self, data: Transitions | None = None) -> Member:
-        """Return the run as a stack takes it. Raises OffbenchError for a bad setting or dataset."""
-        config: Any = build(load_algorithm(self.algorithm).Config, self.settings, self.algorithm)
+    @property
+    def host(self) -> str | None:
+        """The algorithm that this one is a special case of, and whose stack it may join."""
+        joins = getattr(load_algorithm(self.algorithm), "joins", None)
+        return joins[0] if joins else None
+
+    def config(self, kind: str | None = None) -> Any:
+        """Return the settings, as those of `kind` if that is the algorithm's host. Raises OffbenchError."""
+        own: Any = build(load_algorithm(self.algorithm).Config, self.settings, self.algorithm)
+        if kind in (None, self.algorithm):
+            return own
+        _, special = load_algorithm(self.algorithm).joins  # type: ignore[attr-defined]
+        return load_algorithm(str(kind)).Config(**vars(own), **special)
+
+    def member(self, data: Transitions | None = None, kind: str | None = None) -> Member:
+        """Return the run as a stack of `kind` takes it. Raises OffbenchError for a bad setting or dataset."""
         data = data or transitions.load(self.dataset)
-        return Member(Run(Path(self.folder)), self.seed, config, data, data.references)
+        run, guest = Run(Path(self.folder)), kind not in (None, self.algorithm)
+        return Member(run, self.seed, self.config(kind), data, self.algorithm, guest)
 
 
 @dataclass(frozen=True)
 class Job:
     """A stack that is to be trained."""
 
+    kind: str
     orders: tuple[Order, ...]
     schedule: Schedule
     tf32: bool = False
@@ -71,7 +86,7 @@ class Job:
     def title(self) -> str:
         """What a progress bar calls it."""
         first, runs = self.orders[0], len(self.orders)
-        return f"{first.algorithm} on {first.dataset}" + (f" ({runs} runs)" if runs > 1 else "")
+        return f"{self.kind} on {first.dataset}" + (f" ({runs} runs)" if runs > 1 else "")
 
 
 def perform(job: Job, report: Report) -> list[str]:
@@ -86,9 +101,9 @@ def perform(job: Job, report: Report) -> list[str]:
     from offbench.devices import arithmetic
 
     loaded = {name: transitions.load(name) for name in dict.fromkeys(order.dataset for order in job.orders)}
-    members = [order.member(loaded[order.dataset]) for order in job.orders]
+    members = [order.member(loaded[order.dataset], job.kind) for order in job.orders]
     with arithmetic(job.schedule.device, job.tf32):
-        return Trainer(load_algorithm(job.orders[0].algorithm), members, job.schedule).train(report)
+        return Trainer(load_algorithm(job.kind), members, job.schedule).train(report)
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> list[str]:
@@ -157,10 +172,10 @@ class _Pool(contextlib.AbstractContextManager["_Pool"]):
         pipe.close()
         process.join()
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_error: object) -> None:
         for _, process in self.active.values():
             process.terminate()
-        for pipe in tuple(self.active):
+        for pipe in list(self.active):
             self.end(pipe)
 
 

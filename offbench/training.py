@@ -213,7 +213,7 @@ class Trainer:
         means = [float(np.mean([ret for ret, _ in e[step]])) for e in found if step in e]
         if not means:
             return ""
-        references = self.members[0].references
+        references = self.members[0].data.references
         if references is None:
             return f"return {np.mean(means):.0f}"
         return f"score {np.mean([normalize(mean, *references) for mean in means]):.1f}"

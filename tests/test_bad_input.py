@@ -80,6 +80,7 @@ CASES: dict[str, tuple[str, str]] = {
     "report --runs nowhere": ("no evaluated runs below nowhere", "offbench train"),
     "compare td3_bc": ("the following arguments are required: B", "--help"),
     "compare td3_bc cql --runs nowhere": ("no evaluated runs below nowhere", ""),
+    "train --tensorboard td3_bc --dataset x-v0": ("unknown dataset 'x-v0'", ""),
     "train td3_bc --dataset MEDIUM --wandb": ("argument --wandb: expected one argument", ""),
     "show x-v0": ("unknown dataset 'x-v0'", ""),
     "show MEDIM": ("did you mean 'tiny-medium-v0'?", ""),

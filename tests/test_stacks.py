@@ -16,9 +16,9 @@ from safetensors.torch import load_file, save_file
 import offbench
 from offbench import checkpoints
 from offbench.errors import OffbenchError
-from offbench.jobs import Job, perform
-from offbench.launch import Order, jobs_of
+from offbench.jobs import Job, Order, perform
 from offbench.runs import Run
+from offbench.stacking import cut, pending
 from offbench.training import Schedule
 
 SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32}
@@ -29,6 +29,10 @@ def orders(dataset: str, runs: str, seeds: int, algorithm: str = "bdb", **settin
     known = {"hidden": [16, 16], "batch_size": 32} | settings
     name = "-".join(f"{key}={value}" for key, value in settings.items())
     return [Order(algorithm, dataset, known, seed, f"{runs}/{algorithm}{name}/{seed}") for seed in range(seeds)]
+
+
+def jobs_of(orders: list[Order], schedule: Schedule, processes: int, stack: int | str = "auto") -> list[Job]:
+    return [job for part in cut(orders, "cpu", processes, stack) for job in pending(part, schedule)]
 
 
 def finish(jobs: list[Job]) -> None:
@@ -120,3 +124,24 @@ def test_a_run_that_diverges_is_marked_and_the_others_go_on(medium: str) -> None
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
     with pytest.raises(OffbenchError, match="seed-0 has diverged before and is left as it is"):
         offbench.train("td3_bc", medium, steps=300, **common)
+
+
+def test_td3_bc_as_a_guest_in_a_stack_of_bdb_is_td3_bc(medium: str) -> None:
+    """On a GPU the two train as one program. Started as a guest, gone on with alone: the same bits all the way."""
+    schedule = Schedule(200, 100, 2, "cpu", 0)
+    td3_bc, bdb = (orders(medium, "together", 1, algorithm=name)[0] for name in ("td3_bc", "bdb"))
+    own = [td3_bc.member(kind=kind) for kind in ("td3_bc", "bdb")]
+    assert [type(member.config).__module__ for member in own] == ["offbench.algos.td3_bc", "offbench.algos.bdb"]
+    (part,) = cut([replace(td3_bc, seed=3)], "cpu", 1)
+    assert part.kind == "td3_bc"  # on a CPU a guest would only cost more
+    pending(part, schedule)  # claims the run
+    finish([Job("bdb", (replace(td3_bc, seed=3),), replace(schedule, steps=100))])
+    finish([Job("td3_bc", (replace(td3_bc, seed=3),), schedule)])
+    alone = replace(orders(medium, "alone", 1, algorithm="td3_bc")[0], seed=3)
+    finish([Job("td3_bc", (alone,), schedule)])
+    finish([Job("bdb", (replace(td3_bc, seed=3),), replace(schedule, steps=300))])  # and back again
+    finish([Job("td3_bc", (alone,), replace(schedule, steps=300))])
+    ours, theirs = (load_file(Path(o.folder) / "checkpoint-000000300.safetensors") for o in (td3_bc, alone))
+    assert theirs.keys() < ours.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    assert bdb.host is None
