@@ -179,7 +179,9 @@ def loss_figure(
 
 def _column(entry: Entry, column: str) -> tuple[list[int], np.ndarray[Any, Any]] | None:
     """Return (steps, values [runs, steps]) of the rows that all runs have; long series are thinned."""
-    series = [{int(row["step"]): row[column] for row in t.run.losses() if column in row} for t in entry.runs]
+    series = [
+        {int(row["step"]): row[column] for row in t.run.losses() if {"step", column} <= row.keys()} for t in entry.runs
+    ]
     steps = sorted(set.intersection(*(set(found) for found in series)))
     steps = steps[:: max(1, len(steps) // 200)]
     if not steps:

@@ -30,6 +30,7 @@ from offbench.report_tables import scale
 from offbench.results import Entry, Method, Results, read_results
 
 PAGE = "index.html"
+GENERATOR = '<meta name="generator" content="offbench">'  # by which an older report is known
 STATES = {"unfinished": "are unfinished", "diverged": "diverged"}
 
 
@@ -47,19 +48,34 @@ def report(runs: str | Path = "runs", out: str | Path = "report") -> Path:
         OffbenchError: no evaluated runs, a damaged one, or the folder cannot be written.
     """
     results, folder = read_results(runs), Path(out)
-    if folder.exists() and not folder.is_dir():
-        raise OffbenchError(f"{folder} is a file; give another --out")
-    found = _tables(results)
-    pictures = _figures(results)
-    for one in found.values():
-        for ending, data in files(one).items():
-            write_bytes(folder / "tables" / f"{one.name}.{ending}", data)
+    before = _older(folder)
+    found, pictures = _tables(results), _figures(results)
+    written = {f"tables/{one.name}.{end}": data for one in found.values() for end, data in files(one).items()}
     for figure in (figure for group in pictures.values() for figure in group):
-        write_bytes(folder / "figures" / f"{figure.name}.png", figure.png)
-        write_bytes(folder / "figures" / f"{figure.name}.svg", figure.svg)
+        written |= {f"figures/{figure.name}.png": figure.png, f"figures/{figure.name}.svg": figure.svg}
+    for name, data in written.items():
+        write_bytes(folder / name, data)
+    for path in before - {folder / name for name in written}:
+        path.unlink(missing_ok=True)
     content = page("Offline RL benchmark", _lead(results), list(_sections(results, found, pictures)), boxes(results))
     write_bytes(folder / PAGE, content)  # last: a page's links all lead somewhere
     return folder / PAGE
+
+
+def _older(folder: Path) -> set[Path]:
+    """Return the tables and figures of an older report. Raises OffbenchError if the folder is something else's."""
+    if folder.exists() and not folder.is_dir():
+        raise OffbenchError(f"{folder} is a file; give another --out")
+    page = folder / PAGE
+    if not page.exists():
+        return set()
+    if GENERATOR not in page.read_text(encoding="utf-8", errors="replace"):
+        raise OffbenchError(f"{page} is not a report of offbench; give another --out")
+    return {
+        path
+        for kind in ("tables/*.csv", "tables/*.md", "tables/*.tex", "figures/*.png", "figures/*.svg")
+        for path in folder.glob(kind)
+    }
 
 
 def _tables(results: Results) -> dict[str, Table]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import importlib.resources
 import json
-import re
+import math
 import shutil
-from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,48 +15,10 @@ import offbench
 from offbench import assess, reporting
 from offbench.cli import main
 from offbench.files import write_json
-from offbench.report_figures import shortened
 from offbench.report_tables import published
 from offbench.results import Method, Task, read_results
 from tests.made_runs import METHODS, made_grid, made_run
-
-
-class Page(HTMLParser):
-    """What a browser would see: elements, their attributes, and the text of each section and box."""
-
-    VOID = ("meta", "img", "br", "wbr")
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-        self.ids: list[str] = []
-        self.feed(path.read_text())
-        assert self.open == []  # every element is closed, in order
-
-    def handle_starttag(self, name: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.elements.append((name, dict(attributes)))
-        self.ids += [value for key, value in attributes if key == "id" and value]
-        if name not in self.VOID:
-            self.open.append(name)
-
-    def handle_startendtag(self, name: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.handle_starttag(name, attributes)
-        if name not in self.VOID:
-            self.open.pop()
-
-    def handle_endtag(self, name: str) -> None:
-        assert self.open.pop() == name
-
-    def handle_data(self, data: str) -> None:
-        if self.open[-1:] not in (["script"], ["style"]):
-            self.text += data
-
-
-def rows(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+from tests.pages import Page, rows
 
 
 def test_a_whole_grid(home: Path) -> None:
@@ -250,6 +211,25 @@ def test_a_file_where_the_report_should_be(home: Path, capsys: pytest.CaptureFix
     assert "taken is a file" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [{"references": None}, {"references": {"dataset": [0, 0]}}, {"references": {"d4rl": ["a", "b"]}}, {"seed": "0"}],
+)
+def test_a_damaged_config_is_said(home: Path, damage: dict[str, Any]) -> None:
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    write_json(run.config_path, json.loads(run.config_path.read_text()) | damage)
+    with pytest.raises(offbench.OffbenchError, match=r"config\.json is damaged"):
+        offbench.report(home / "runs", home / "out")
+
+
+def test_losses_that_are_not_finite_are_drawn_as_gaps(home: Path) -> None:
+    run = made_run(home / "runs", "hopper-medium-v0", "bdb", "default", 0, 50)
+    run.write_losses([{"step": 1000.0 * i, "q_abs": q} for i, q in enumerate((1.0, math.inf, 2.0, math.nan, 3.0))])
+    assert "critic" in Page(offbench.report(home / "runs", home / "out")).ids
+    run.write_losses([{"q_abs": 1.0}])  # without steps there is nothing to draw
+    assert "critic" not in Page(offbench.report(home / "runs", home / "out")).ids
+
+
 def test_damaged_similarity_is_said(home: Path) -> None:
     run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
     for text in ("[]", '{"q_similar": "much"}', "{"):
@@ -270,72 +250,27 @@ def test_the_same_runs_give_the_same_bytes(home: Path) -> None:
     assert first == second
 
 
-HOSTILE = "<script>hacked=1</script><img src=x onerror=hacked=1>\"'--> $x^{ %&#_~|`</style>"
+def test_an_older_report_is_replaced_whole(home: Path) -> None:
+    made_grid(home / "runs", seeds=1, levels=1)
+    other = made_run(home / "runs", "my-data-v0", "td3_bc", "default", 0, 50)
+    offbench.report(home / "runs", home / "out")
+    (home / "out" / "notes.txt").write_text("mine")
+    assert (home / "out" / "figures" / "curves-my-data-v0.png").exists()
+    shutil.rmtree(other.folder)
+    offbench.report(home / "runs", home / "out")
+    offbench.report(home / "runs", home / "fresh")
+    names = [{str(p.relative_to(home / out)) for p in (home / out).rglob("*")} for out in ("out", "fresh")]
+    assert names[0] - names[1] == {"notes.txt"}
+    assert names[1] <= names[0]
 
 
-def hostile_runs(root: Path) -> None:
-    for seed in range(2):
-        for algorithm in ("td3_bc", HOSTILE):
-            settings = {"beta": HOSTILE, HOSTILE: HOSTILE}
-            run = made_run(root, f"_{HOSTILE}-v0", algorithm, HOSTILE, seed, 50, settings=settings, beta=0.5)
-            config = json.loads(run.config_path.read_text())
-            bad = {
-                "command": HOSTILE,
-                "versions": {HOSTILE: HOSTILE},
-                "hardware": {HOSTILE: HOSTILE},
-                "device": HOSTILE,
-            }
-            write_json(run.config_path, config | bad)
-
-
-def test_names_that_are_markup_stay_text(home: Path) -> None:
-    hostile_runs(home / "runs")
-    path = offbench.report(home / "runs", home / "out")
-    page = Page(path)
-    names = [name for name, _ in page.elements]
-    assert names.count("script") == 1
-    assert names.count("style") == 1
-    assert "img" not in names
-    assert not [key for _, attributes in page.elements for key in attributes if key.startswith("on")]
-    assert HOSTILE in page.text.replace("\xa0", " ")
-    outside = re.sub(r"<script>.*?</script>", "", path.read_text(), flags=re.DOTALL)
-    assert "hacked=1" in outside  # as text
-    assert "<img" not in (home / "out" / "tables" / "scores.md").read_text()
-    latex = (home / "out" / "tables" / "scores.tex").read_text()
-    assert all(line.startswith(("%", "\\")) or line.endswith(r" \\") for line in latex.splitlines())
-    assert "<script" not in latex.replace("% ", "")
-
-
-def test_long_names_are_shortened_in_pictures() -> None:
-    assert shortened("td3_bc", 8) == "td3_bc"
-    assert shortened("abcdefghijkl", 8) == "abcd…jkl"
-    assert len(shortened("x" * 99, 24)) == 24
-
-
-def test_nothing_is_fetched(home: Path) -> None:
-    made_grid(home / "runs", seeds=2, levels=1)
-    page = Page(offbench.report(home / "runs", home / "out"))
-    for name, attributes in page.elements:
-        for key in ("src", "srcset", "data", "action", "poster", "xlink:href"):
-            value = attributes.get(key) or "#"
-            assert value.startswith(("#", "data:")), (name, key, value)
-        assert name not in ("link", "iframe", "object", "embed", "base", "form")
-    policies = [a["content"] or "" for name, a in page.elements if a.get("http-equiv") == "Content-Security-Policy"]
-    assert len(policies) == 1
-    assert "default-src 'none'" in policies[0]
-    assert "unsafe-inline'; script" not in policies[0].replace("style-src 'unsafe-inline'; img", "")
-
-
-def test_tables_are_accessible(home: Path) -> None:
-    made_grid(home / "runs", seeds=2, levels=1)
-    page = Page(offbench.report(home / "runs", home / "out"))
-    count = {name: sum(n == name for n, _ in page.elements) for name in ("table", "caption", "th")}
-    assert count["table"] == count["caption"] + len(METHODS)  # boxes name theirs by their heading
-    assert all(a.get("scope") in ("row", "col") for name, a in page.elements if name == "th")
-    pictures = [a for name, a in page.elements if a.get("role") == "img" and name == "div"]
-    assert pictures
-    assert all(len(a["aria-label"] or "") > 20 for a in pictures)
-    assert dict(page.elements)["html"]["lang"] == "en"
+def test_another_page_is_not_replaced(home: Path) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    (home / "out").mkdir()
+    (home / "out" / "index.html").write_text("my home page")
+    with pytest.raises(offbench.OffbenchError, match="is not a report of offbench"):
+        offbench.report(home / "runs", home / "out")
+    assert (home / "out" / "index.html").read_text() == "my home page"
 
 
 def test_a_shipped_dataset_card_is_shown(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,6 @@ skipped without them. OFFBENCH_SCREENSHOTS names a folder to keep what was seen.
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,33 +14,21 @@ from typing import Any
 import pytest
 
 import offbench
+from tests.browsers import VIEWS, chromium
 from tests.made_runs import made_grid
-from tests.test_report import hostile_runs
+from tests.pages import hostile_runs
 
 pytestmark = pytest.mark.slow
-VIEWS: dict[str, dict[str, Any]] = {
-    "wide": {"viewport": {"width": 1360, "height": 900}},
-    "dark": {"viewport": {"width": 1360, "height": 900}, "color_scheme": "dark"},
-    "phone": {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "device_scale_factor": 2},
-}
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A headless Chromium: the system's, or the one playwright has downloaded."""
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is missing: pip install offbench[browser]"
-    )
-    names = ("chromium", "chromium-browser", "google-chrome")
-    system = next((path for name in names if (path := shutil.which(name))), None)
-    with playwright.sync_playwright() as driver:
-        path = system or driver.chromium.executable_path
-        if not Path(path).exists():
-            pytest.skip("no Chromium here: apt-get install chromium, or playwright install chromium")
-        # the sandbox needs a user namespace, which containers often lack; the page is our own
-        chromium = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
+    """A headless Chromium."""
+    try:
+        with chromium() as found:
+            yield found
+    except (ImportError, FileNotFoundError) as error:
+        pytest.skip(str(error))
 
 
 def opened(browser: Any, path: Path, view: str) -> tuple[Any, list[str], list[str]]:
