@@ -7,6 +7,7 @@
     runs = offbench.train("bdb", dataset_id, seeds=range(5), beta=0.5)
     offbench.evaluate(runs[0]).scores
     offbench.normalize()                                    # every run below ./runs
+    offbench.report()                                       # the same as a page, report/index.html
 
 The command line (`offbench --help`) calls these same functions.
 """

@@ -6,8 +6,10 @@ import csv
 import importlib.util
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 import types
 from collections import Counter
 from collections.abc import Callable
@@ -79,6 +81,26 @@ def test_steps_that_a_kill_took_back_are_not_shown(medium: str) -> None:
     newest.unlink()
     (folder,) = offbench.train("td3_bc", medium, steps=60, eval_every=20, tensorboard=True, **SIZES)
     check_events(Run(folder))
+
+
+@pytest.mark.slow
+def test_a_killed_training_shows_every_step_once(medium: str, home: Path) -> None:
+    pytest.importorskip("tensorboard")
+    words = ["--steps", "4000", "--eval-every", "200", "--eval-episodes", "1", "--hidden", "8", "--tensorboard"]
+    command = [sys.executable, "-m", "offbench", "train", "td3_bc", "--dataset", medium, *words]
+    for kill in (1, 4, 0):  # after so many evaluations more; the last one ends by itself
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=home)
+        before = sum(len(Run(path.parent).evaluations()) for path in home.glob("runs/**/evaluations.csv"))
+        while kill and process.poll() is None:
+            known = sum(len(Run(path.parent).evaluations()) for path in home.glob("runs/**/evaluations.csv"))
+            if known >= before + kill:
+                process.kill()
+            time.sleep(0.02)
+        _, errors = process.communicate(timeout=300)
+        assert process.returncode == (-signal.SIGKILL if kill else 0), errors
+    (path,) = home.glob("runs/**/evaluations.csv")
+    assert len(Run(path.parent).evaluations()) == 20
+    check_events(Run(path.parent))
 
 
 def test_the_flag_writes_event_files(offbench_cli: Cli, medium: str, home: Path) -> None:

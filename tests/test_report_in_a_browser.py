@@ -82,6 +82,18 @@ def test_the_report_opens_sorts_and_explains_a_cell(browser: Any, home: Path, vi
     assert requests == [path.as_uri()]
 
 
+def test_tables_fit_on_a_printed_page(browser: Any, home: Path) -> None:
+    made_grid(home / "runs", envs=("hopper", "walker2d"), seeds=2, levels=2)
+    path = offbench.report(home / "runs", home / "out").absolute()
+    # the page within its margins at 96 dots an inch: A4 across less 12 mm left and right
+    page = browser.new_context(viewport={"width": 1032, "height": 703}, color_scheme="dark").new_page()
+    page.goto(path.as_uri())
+    page.emulate_media(media="print")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 1032
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    assert page.locator("nav").is_hidden()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_text_can_be_read_on_its_ground(browser: Any, home: Path, scheme: str) -> None:
     """Contrast of at least 4.5 to 1 (WCAG AA) of ink, small print and links on page, card and mark."""
