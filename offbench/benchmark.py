@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -23,17 +23,46 @@ from offbench.errors import OffbenchError
 from offbench.grid import Entry, Grid, Source, Times, load_grid
 from offbench.jobs import Job, Order, run_jobs
 from offbench.launch import configurations
+from offbench.levels import parse_level
 from offbench.progress import duration
 from offbench.recipes import Recipe, load_recipe
+from offbench.record import record_source
 from offbench.registry import load_algorithm
 from offbench.runs import run_folder, settings_dict, variant
 from offbench.stacking import Part, cut, pending, with_evaluators
 from offbench.training import Schedule
 from offbench.workers import default_workers
 
-Executor = Callable[[Sequence[Job], int], list[str]]
 UNITS = {"s": 1, "m": 60, "h": 3600}
-WAIT = 5.0  # seconds between two looks at a dataset that another process records
+
+
+class Executor(Protocol):
+    """Where recordings and trainings happen."""
+
+    def record(self, sources: Sequence[Source], workers: int) -> None:
+        """Record datasets. Raises OffbenchError if one cannot be."""
+        ...
+
+    def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
+        """Train jobs as far as their deadline; return what went wrong, a line each."""
+        ...
+
+
+class LocalExecutor:
+    """This machine's processes."""
+
+    def __init__(self, deadline: float | None = None) -> None:
+        self.deadline = deadline
+
+    def record(self, sources: Sequence[Source], workers: int) -> None:
+        """Record datasets, one after the other, until the deadline."""
+        for source in sources:
+            if self.deadline is None or time.time() < self.deadline:
+                record_source(source, workers)
+
+    def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
+        """Train jobs in so many processes."""
+        return run_jobs(jobs, processes)
 
 
 @dataclass(frozen=True)
@@ -98,7 +127,7 @@ def benchmark(
     tf32: bool = False,
     budget: str | None = None,
     shard: tuple[int, int] = (0, 1),
-    executor: Executor = run_jobs,
+    executor: Executor | None = None,
     command: str = "",
     say: Callable[[str], None] = print,
 ) -> bool:
@@ -110,7 +139,7 @@ def benchmark(
         device, workers, stack, tf32: as in `train`.
         budget: "9m", "2h" or "90s": stops cleanly after that time; the same call goes on.
         shard: (i, n): the i-th of n shares of the stacks, for machines with a shared file system.
-        executor: what trains the jobs: local processes, or a cluster's (offbench.cluster).
+        executor: where it happens: this machine (default), or a cluster (offbench.cluster.RayExecutor).
         command: what the user typed, for each run's config.json.
         say: takes the plan, line by line.
 
@@ -121,13 +150,13 @@ def benchmark(
         OffbenchError: anything that the user can mend; runs that diverged, once all others are done.
     """
     deadline = time.time() + _seconds(budget) if budget else None
+    executor = executor or LocalExecutor(deadline)
     bench = prepare(grid, runs=runs, device=device, workers=workers, stack=stack, tf32=tf32)
     for line in plan(bench):
         say(line)
-    for source in bench.missing():
-        if deadline and time.time() > deadline:
-            return False
-        _record(source, bench.workers)
+    executor.record(bench.missing(), bench.workers)
+    if bench.missing():
+        return False  # out of time
     parts = _parts(bench, shard)
     jobs = [
         job
@@ -136,7 +165,7 @@ def benchmark(
     ]
     if bench.device != "cpu":
         jobs = with_evaluators(jobs, bench.workers)
-    problems = executor(jobs, bench.processes) if jobs else []
+    problems = executor.train(jobs, bench.processes) if jobs else []
     if problems:
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise OffbenchError(problems[0] + more)
@@ -194,27 +223,6 @@ def _parts(bench: Benchmark, shard: tuple[int, int]) -> list[tuple[Part, Schedul
         schedule = Schedule(times.steps, times.eval_every, times.eval_episodes, bench.device, workers=0)
         found += [(part, schedule) for part in cut(orders, bench.device, bench.processes * count, bench.stack)]
     return found[place::count]
-
-
-def _record(source: Source, workers: int) -> None:
-    """Record a dataset, or wait for the process that is at it."""
-    from offbench.record import collect
-
-    if not source.env:
-        raise OffbenchError(
-            f"{source.id} is no local dataset and no level of a known environment; "
-            "record or download it, or write its env and level into the grid"
-        )
-    while source.id not in dataset.local_ids():
-        try:
-            collect(
-                source.env, source.level, steps=source.steps, seed=source.seed, workers=workers, dataset_id=source.id
-            )
-        except OffbenchError:
-            # another shard is at it, or has just done it
-            if not dataset.being_recorded(source.id) and source.id not in dataset.local_ids():
-                raise
-            time.sleep(WAIT)
 
 
 def plan(bench: Benchmark) -> Iterator[str]:
@@ -283,8 +291,6 @@ def _size(source: Source) -> int:
     """Return the transitions of a dataset that is to be recorded, about."""
     if source.steps or not source.env:
         return source.steps or 0
-    from offbench.levels import parse_level
-
     _, parts = parse_level(source.level)
     return round(_recipe(source).dataset_steps * sum(part.weight for part in parts))
 

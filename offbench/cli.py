@@ -182,16 +182,33 @@ def _benchmark(parser: Parser, words: list[str]) -> None:
     parser.add_argument("--plan", action="store_true", help="print runs, cost and disk, and do nothing")
     parser.add_argument("--budget", metavar="TIME", help="stop cleanly after 90s, 9m or 2h; the same command goes on")
     parser.add_argument("--shard", type=share, default=(0, 1), metavar="I/N", help="the I-th of N shares, I from 0")
+    parser.add_argument("--executor", choices=("local", "ray"), default="local", help="default: local processes")
+    parser.add_argument(
+        "--address", help="of the Ray cluster, e.g. auto or ray://head:10001 (default: start one here)"
+    )
     _machine(parser)
 
-    def run(plan: bool, budget: str | None, shard: tuple[int, int], **arguments: Any) -> None:
+    def run(
+        plan: bool,
+        budget: str | None,
+        shard: tuple[int, int],
+        executor: str,
+        address: str | None,
+        **arguments: Any,
+    ) -> None:
         from offbench import benchmark, tables
 
         if plan:
             print("\n".join(benchmark.plan(benchmark.prepare(**arguments))))
             return
         command = shlex.join(["offbench", "benchmark", *words])
-        finished = benchmark.benchmark(**arguments, budget=budget, shard=shard, command=command)
+        where = None
+        if executor == "ray":
+            from offbench.cluster import RayExecutor
+
+            where = RayExecutor(address)
+            arguments["workers"] = arguments["workers"] or where.cpus
+        finished = benchmark.benchmark(**arguments, budget=budget, shard=shard, executor=where, command=command)
         print(tables.render(tables.score_runs(arguments["runs"])))
         if not finished:
             print("stopped at the budget; the same command goes on", file=sys.stderr)

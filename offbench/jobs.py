@@ -112,33 +112,34 @@ def run_jobs(jobs: Sequence[Job], processes: int) -> list[str]:
     Returns:
         What went wrong, a line each.
     """
-    total = sum(job.updates for job in jobs)
-    title = jobs[0].title if len(jobs) == 1 else f"{sum(len(job.orders) for job in jobs)} runs"
-    with Progress(total, title) as progress:
-        board = _Board(jobs, progress)
+    with Board(jobs) as board:
         if processes == 1 or len(jobs) == 1:
             return [line for i, job in enumerate(jobs) for line in _here(job, i, board)]
         with _Pool() as pool:
             return list(_spread(jobs, processes, pool, board))
 
 
-class _Board:
+class Board(contextlib.AbstractContextManager["Board"]):
     """Adds up the jobs' steps for one progress bar."""
 
-    def __init__(self, jobs: Sequence[Job], progress: Progress) -> None:
-        self.jobs, self.progress = jobs, progress
-        self.steps: dict[int, int] = {}
+    def __init__(self, jobs: Sequence[Job]) -> None:
+        self.jobs, self.steps = jobs, dict[int, int]()
+        runs = sum(len(job.orders) for job in jobs)
+        self.progress = Progress(sum(job.updates for job in jobs), jobs[0].title if len(jobs) == 1 else f"{runs} runs")
+
+    def __exit__(self, *error: Any) -> None:
+        self.progress.__exit__(*error)
 
     def at(self, job: int, step: int, note: str) -> None:
+        """Take in that a job is at `step`."""
         if job not in self.steps:  # what was there before counts as done, not as speed
             self.progress.skip(step * len(self.jobs[job].orders))
-            self.steps[job] = step
         self.steps[job] = step
         self.progress.to(sum(step * len(self.jobs[i].orders) for i, step in self.steps.items()), note)
 
 
-def _here(job: Job, place: int, board: _Board) -> list[str]:
-    if _over(job):
+def _here(job: Job, place: int, board: Board) -> list[str]:
+    if is_over(job):
         return []
     try:
         return perform(job, lambda step, note: board.at(place, step, note))
@@ -148,7 +149,8 @@ def _here(job: Job, place: int, board: _Board) -> list[str]:
         return [str(error)]
 
 
-def _over(job: Job) -> bool:
+def is_over(job: Job) -> bool:
+    """Whether a job's deadline has passed."""
     return job.schedule.deadline is not None and time.time() > job.schedule.deadline
 
 
@@ -179,12 +181,12 @@ class _Pool(contextlib.AbstractContextManager["_Pool"]):
             self.end(pipe)
 
 
-def _spread(jobs: Sequence[Job], processes: int, pool: _Pool, board: _Board) -> Iterator[str]:
+def _spread(jobs: Sequence[Job], processes: int, pool: _Pool, board: Board) -> Iterator[str]:
     waiting = collections.deque(enumerate(jobs))
     while waiting or pool.active:
         while waiting and len(pool.active) < processes:
             place, job = waiting.popleft()
-            if not _over(job):
+            if not is_over(job):
                 pool.start(place, job)
         for ready in wait(list(pool.active)):
             assert isinstance(ready, Connection)
