@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from offbench.record import collect
     from offbench.tables import normalize_runs_or_returns as normalize
     from offbench.transitions import load
+    from offbench.verify import verify
 
 __all__ = [
     "OffbenchError",
@@ -37,6 +38,7 @@ __all__ = [
     "normalize",
     "show",
     "train",
+    "verify",
 ]
 
 # Loaded when first used: `offbench list` must not wait for PyTorch.
@@ -49,6 +51,7 @@ _VERBS = {
     "normalize": ("offbench.tables", "normalize_runs_or_returns"),
     "show": ("offbench.describe", "show"),
     "train": ("offbench.launch", "train"),
+    "verify": ("offbench.verify", "verify"),
 }
 
 

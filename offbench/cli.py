@@ -18,6 +18,7 @@ COMMANDS = {
     "behaviour": "train an environment's behaviour agent (SAC) and build its ladder",
     "list": "environments, levels, algorithms and local datasets",
     "show": "what is in a dataset",
+    "verify": "check a dataset: its arrays, its metadata, and a sample of episodes played again",
     "card": "write an environment's dataset card from its five recorded levels",
 }
 
@@ -31,7 +32,10 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run one command; exit with 0, with 2 for a problem the user can mend, with 130 after Ctrl-C."""
+    """Run one command.
+
+    Exits with 0, 1 if `verify` found something, 2 for a problem the user can mend, 130 after Ctrl-C.
+    """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         _run(words)
@@ -239,6 +243,23 @@ def _show(parser: Parser, _: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
+def _verify(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset, anybody's")
+    parser.add_argument("--episodes", type=natural, help="to play again (default: 300; 0: none)")
+    parser.add_argument("--workers", type=whole, help="processes (default: one a core)")
+    parser.add_argument("--json", action="store_true", dest="as_json", help="print the report as JSON")
+
+    def run(as_json: bool, **arguments: Any) -> None:
+        from offbench.verify import verify
+
+        report = verify(**arguments)
+        print(report.to_json() if as_json else "\n".join(report.lines()))
+        if not report.ok:
+            sys.exit(1)
+
+    parser.set_defaults(run=run)
+
+
 def _card(parser: Parser, _: list[str]) -> None:
     parser.add_argument("env", metavar="ENV", help="a recipe with a ladder in the folder `behaviour` beside it")
     parser.add_argument("--out", metavar="DIR", help="where the card goes (default: <env>-card)")
@@ -259,6 +280,7 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "behaviour": _behaviour,
     "list": _list,
     "show": _show,
+    "verify": _verify,
     "card": _card,
 }
 
