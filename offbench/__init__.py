@@ -21,7 +21,9 @@ from offbench.errors import OffbenchError
 if TYPE_CHECKING:
     from offbench.agents import behaviour
     from offbench.assess import evaluate
+    from offbench.d4rl import import_d4rl
     from offbench.describe import inventory, show
+    from offbench.export import export
     from offbench.launch import train
     from offbench.record import collect
     from offbench.tables import normalize_runs_or_returns as normalize
@@ -33,6 +35,8 @@ __all__ = [
     "behaviour",
     "collect",
     "evaluate",
+    "export",
+    "import_d4rl",
     "inventory",
     "load",
     "normalize",
@@ -46,6 +50,8 @@ _VERBS = {
     "behaviour": ("offbench.agents", "behaviour"),
     "collect": ("offbench.record", "collect"),
     "evaluate": ("offbench.assess", "evaluate"),
+    "export": ("offbench.export", "export"),
+    "import_d4rl": ("offbench.d4rl", "import_d4rl"),
     "inventory": ("offbench.describe", "inventory"),
     "load": ("offbench.transitions", "load"),
     "normalize": ("offbench.tables", "normalize_runs_or_returns"),

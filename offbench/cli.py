@@ -19,6 +19,8 @@ COMMANDS = {
     "list": "environments, levels, algorithms and local datasets",
     "show": "what is in a dataset",
     "verify": "check a dataset: its arrays, its metadata, and a sample of episodes played again",
+    "import-d4rl": "turn a D4RL file (v0, v1, v2) into a Minari dataset",
+    "export": "write a dataset as a D4RL file, or as arrays (npz)",
     "card": "write an environment's dataset card from its five recorded levels",
 }
 
@@ -260,6 +262,36 @@ def _verify(parser: Parser, _: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
+def _import(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("file", metavar="FILE.hdf5", help="a D4RL file, or one that `offbench export` wrote")
+    parser.add_argument("--id", dest="dataset_id", required=True, help="the Minari id, e.g. d4rl-hopper-medium-v2")
+    parser.add_argument("--env", metavar="RECIPE", help="the environment to evaluate in (default: by the file's name)")
+    parser.add_argument("--overwrite", action="store_true", help="replace a dataset of that id")
+
+    def run(**arguments: Any) -> None:
+        from offbench.d4rl import import_d4rl
+
+        print(f"{import_d4rl(**arguments)} imported; next: offbench show {arguments['dataset_id']}")
+
+    parser.set_defaults(run=run)
+
+
+def _export(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset")
+    parser.add_argument("--out", required=True, metavar="FILE", help="the file to write")
+    parser.add_argument("--format", choices=("d4rl", "npz"), default="d4rl", dest="style", help="default: d4rl")
+    parser.add_argument(
+        "--drop-timeouts", action="store_true", help="npz: without the steps that D4RL's qlearning_dataset drops"
+    )
+
+    def run(**arguments: Any) -> None:
+        from offbench.export import export
+
+        print(f"written to {export(**arguments)}")
+
+    parser.set_defaults(run=run)
+
+
 def _card(parser: Parser, _: list[str]) -> None:
     parser.add_argument("env", metavar="ENV", help="a recipe with a ladder in the folder `behaviour` beside it")
     parser.add_argument("--out", metavar="DIR", help="where the card goes (default: <env>-card)")
@@ -281,6 +313,8 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "list": _list,
     "show": _show,
     "verify": _verify,
+    "import-d4rl": _import,
+    "export": _export,
     "card": _card,
 }
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from filelock import FileLock, Timeout
 from gymnasium.envs.registration import EnvSpec
@@ -126,7 +127,14 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
         lock.release()
 
 
-def write(path: Path, episodes: Iterable[Episode], spec: str, metadata: dict[str, Any], steps: int) -> str:
+def write(
+    path: Path,
+    episodes: Iterable[Episode],
+    spec: str,
+    metadata: dict[str, Any],
+    steps: int,
+    spaces: tuple[gym.Space[Any], gym.Space[Any]] | None = None,
+) -> str:
     """Write episodes as a Minari HDF5 dataset at `path`, whole or not at all; return the content hash.
 
     Args:
@@ -134,6 +142,7 @@ def write(path: Path, episodes: Iterable[Episode], spec: str, metadata: dict[str
         spec: the environment's EnvSpec as JSON.
         metadata: Minari's fields; the content hash joins those under the key `offbench`.
         steps: transitions to come, to see beforehand whether the disk has room.
+        spaces: of observations and actions, where the environment is not to be asked (it may be no longer there).
     """
     env_spec = EnvSpec.from_json(spec)
     aside, old = path.with_name(f".offbench-{path.name}.partial"), _old(path)
@@ -143,7 +152,7 @@ def write(path: Path, episodes: Iterable[Episode], spec: str, metadata: dict[str
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                storage = MinariStorage.new(aside / "data", env_spec=env_spec, data_format="hdf5")
+                storage = MinariStorage.new(aside / "data", *(spaces or (None, None)), env_spec, "hdf5")
             _check_room(aside, storage, steps)
             content = ContentHash()
             storage.update_episodes(_buffers(episodes, storage.observation_space.dtype, content))

@@ -98,14 +98,10 @@ class Summary:
         for part in ours.get("parts", []):
             words = ", ".join(f"{key} {value}" for key, value in part.items())
             lines.append(f"made from    {words}")
-        if ours:
-            made = ", ".join(f"{name} {version}" for name, version in ours["versions"].items())
-            lines += [
-                f"seed         {ours['seed']}",
-                f"versions     {made}",
-                f"content      sha256 {ours['content_sha256']}",
-            ]
-        return lines
+        made = ", ".join(f"{name} {version}" for name, version in ours.get("versions", {}).items())
+        told = {"seed": ours.get("seed"), "versions": made or None, "content": ours.get("content_sha256")}
+        told["imported"] = ours.get("imported", {}).get("file")
+        return lines + [f"{key:<12} {value}" for key, value in told.items() if value is not None]
 
     def plot(self, path: str | Path) -> Path:
         """Draw the histogram of returns. Raises OffbenchError if the picture cannot be written."""
