@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from offbench.assess import evaluate
     from offbench.d4rl import import_d4rl
     from offbench.describe import inventory, show
-    from offbench.export import export
+    from offbench.exports import export
     from offbench.launch import train
     from offbench.record import collect
     from offbench.tables import normalize_runs_or_returns as normalize
     from offbench.transitions import load
-    from offbench.verify import verify
+    from offbench.verification import verify
 
 __all__ = [
     "OffbenchError",
@@ -50,14 +50,14 @@ _VERBS = {
     "behaviour": ("offbench.agents", "behaviour"),
     "collect": ("offbench.record", "collect"),
     "evaluate": ("offbench.assess", "evaluate"),
-    "export": ("offbench.export", "export"),
+    "export": ("offbench.exports", "export"),
     "import_d4rl": ("offbench.d4rl", "import_d4rl"),
     "inventory": ("offbench.describe", "inventory"),
     "load": ("offbench.transitions", "load"),
     "normalize": ("offbench.tables", "normalize_runs_or_returns"),
     "show": ("offbench.describe", "show"),
     "train": ("offbench.launch", "train"),
-    "verify": ("offbench.verify", "verify"),
+    "verify": ("offbench.verification", "verify"),
 }
 
 

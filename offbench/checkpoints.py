@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from offbench.files import write_bytes
+from offbench.policy import content_sha256
 
 KEPT = 2
 _NAME = re.compile(r"checkpoint-(\d{9,})\.safetensors")
@@ -23,7 +24,8 @@ State = dict[str, Any]
 def save_checkpoint(folder: Path, step: int, tensors: dict[str, torch.Tensor], state: State) -> None:
     """Write checkpoint-<step>.safetensors, whole or not at all."""
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    data = save(whole, metadata={"offbench": json.dumps(state, sort_keys=True)})
+    about = {"offbench": json.dumps(state, sort_keys=True), "sha256": _sha256(whole, state)}
+    data = save(whole, metadata=about)
     write_bytes(folder / f"checkpoint-{step:09d}.safetensors", data)
 
 
@@ -38,11 +40,21 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], S
     path = folder / f"checkpoint-{step:09d}.safetensors"
     try:
         with safe_open(path, framework="pt") as file:
-            state = json.loads((file.metadata() or {})["offbench"])
-            return {name: file.get_tensor(name) for name in file.keys()}, state  # noqa: SIM118
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
+            about = file.metadata() or {}
+            state = json.loads(about["offbench"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if not isinstance(state, dict) or state.get("step") != step:
+            raise ValueError(f"it is not of step {step}")
+        if about.get("sha256") not in (None, _sha256(tensors, state)):  # older files have none
+            raise ValueError("its content is not what was written (SHA-256)")
+        return tensors, state
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError) as error:
         print(f"offbench: {path} is damaged ({error}); using the one before it", file=sys.stderr)
         return None
+
+
+def _sha256(tensors: dict[str, torch.Tensor], state: State) -> str:
+    return content_sha256({name: tensor.numpy() for name, tensor in tensors.items()}, state)
 
 
 def load_newest(folder: Path) -> tuple[dict[str, torch.Tensor], State] | None:

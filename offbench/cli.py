@@ -252,7 +252,7 @@ def _verify(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--json", action="store_true", dest="as_json", help="print the report as JSON")
 
     def run(as_json: bool, **arguments: Any) -> None:
-        from offbench.verify import verify
+        from offbench.verification import verify
 
         report = verify(**arguments)
         print(report.to_json() if as_json else "\n".join(report.lines()))
@@ -285,7 +285,7 @@ def _export(parser: Parser, _: list[str]) -> None:
     )
 
     def run(**arguments: Any) -> None:
-        from offbench.export import export
+        from offbench.exports import export
 
         print(f"written to {export(**arguments)}")
 

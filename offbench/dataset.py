@@ -13,11 +13,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from filelock import FileLock, Timeout
 from gymnasium.envs.registration import EnvSpec
 
 from offbench.errors import OffbenchError, unknown
-from offbench.files import disk_errors, read_json
+from offbench.files import disk_errors, read_json, sole
 from offbench.policy import Array
 from offbench.rollout import Episode
 
@@ -111,20 +110,14 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
             folder cannot be written.
     """
     path = path_of(dataset_id)
-    with disk_errors(str(path)):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(path.parent / f".offbench-{path.name}.lock")
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            raise OffbenchError(f"{dataset_id} is being recorded by another process; wait for it") from None
-    try:
-        _recover(path)
+    if not path.parent.resolve().is_relative_to(root().resolve()):
+        raise OffbenchError(f"{dataset_id} leads out of {root()} by a link; choose another id")
+    with sole(path.parent / f".offbench-{path.name}.lock", f"{dataset_id} is being recorded"):
+        with disk_errors(str(path)):
+            _recover(path)
         if path.exists() and not overwrite:
             raise OffbenchError(f"{dataset_id} exists already; use --overwrite to replace it, or --id for another id")
         yield path
-    finally:
-        lock.release()
 
 
 def write(

@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -141,6 +142,7 @@ class Policy:
             "activation": self.activation,
         }
         arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in tensors.items()}
+        header["sha256"] = content_sha256(arrays, header)
         return bytes(save(arrays, metadata={"offbench": json.dumps(header, sort_keys=True)}))
 
     def save(self, path: Path) -> None:
@@ -182,6 +184,8 @@ def from_bytes(data: bytes) -> Policy:
     except (SafetensorError, KeyError, TypeError) as error:  # KeyError: a dtype that NumPy lacks
         raise ValueError(f"not safetensors ({error})") from None
     header = _header(data)
+    if header.pop("sha256", None) not in (None, content_sha256(tensors, header)):  # older files have none
+        raise ValueError("its content is not what was written (SHA-256)")
     kind = header.get("kind")
     if header.get("format") != "offbench-policy-1" or kind not in KINDS:
         raise ValueError(f"unknown format {header.get('format')!r} or kind {kind!r}")
@@ -203,6 +207,16 @@ def from_bytes(data: bytes) -> Policy:
     policy = Policy(kind, layers, mean, std, low, high, env_id, origin, critic, samples, activation)
     _check_shapes(policy)
     return policy
+
+
+def content_sha256(arrays: Mapping[str, Array], state: Mapping[str, Any]) -> str:
+    """Return a hash over named arrays and the JSON beside them, so that a flipped bit is no other number."""
+    plain = json.loads(json.dumps(state))  # as it will be read: tuples are lists, keys are text
+    content = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
+    for name in sorted(arrays):
+        content.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}".encode())
+        content.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return content.hexdigest()
 
 
 def _header(data: bytes) -> dict[str, Any]:

@@ -19,13 +19,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock, Timeout
 from torch import Tensor
 
 from offbench import checkpoints, seeds
 from offbench.algorithm import Algorithm, Batch, Draw, stack_configs
 from offbench.errors import OffbenchError
-from offbench.files import disk_errors
+from offbench.files import disk_errors, sole
 from offbench.policy import Policy
 from offbench.progress import Progress
 from offbench.rollout import Outcome, Rollouts, result
@@ -357,14 +356,5 @@ class Trainer:
 @contextlib.contextmanager
 def held(run: Run) -> Iterator[None]:
     """Hold a run's directory for this process. Raises OffbenchError if another one trains it."""
-    with disk_errors(str(run.folder)):
-        run.folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(run.folder / ".lock")
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            raise OffbenchError(f"{run.folder} is being trained by another process; wait for it") from None
-    try:
+    with sole(run.folder / ".lock", f"{run.folder} is being trained"):
         yield
-    finally:
-        lock.release()

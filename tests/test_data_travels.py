@@ -17,10 +17,10 @@ from offbench import dataset, transitions
 from offbench.cli import main
 from offbench.d4rl import import_d4rl
 from offbench.errors import OffbenchError
-from offbench.export import export
+from offbench.exports import export
 from offbench.survey import episodes_of
 from offbench.transitions import open_minari
-from offbench.verify import verify
+from offbench.verification import verify
 
 Columns = dict[str, npt.NDArray[Any]]
 KEYS = ("observations", "actions", "rewards", "next_observations", "terminals")
@@ -221,7 +221,7 @@ def test_npz_holds_what_offbench_trains_on(medium: str, home: Path) -> None:
 
 def test_blocks_join_right(medium: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Small blocks on both ways: episodes lie across them."""
-    monkeypatch.setattr("offbench.export.CHUNK", 37)
+    monkeypatch.setattr("offbench.exports.CHUNK", 37)
     monkeypatch.setattr("offbench.d4rl.BLOCK", 41)
     import_d4rl(export(medium, home / "out.hdf5"), "back-v0")
     assert transitions.load("back-v0").content == transitions.load(medium).content
@@ -233,7 +233,7 @@ def test_a_failed_export_leaves_the_old_file(medium: str, home: Path, monkeypatc
     def fail(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("offbench.export.os.replace", fail)
+    monkeypatch.setattr("offbench.exports.os.replace", fail)
     with pytest.raises(OffbenchError, match="No space left"):
         export(medium, home / "out.hdf5")
     assert (home / "out.hdf5").read_text() == "old"

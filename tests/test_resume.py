@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -278,4 +279,4 @@ main(["train", "td3_bc", "--dataset", {medium!r}, "--steps", "200", "--eval-ever
     with held(run):
         found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=dict(os.environ))
     assert found.returncode == 2
-    assert "being trained by another process" in found.stderr
+    assert f"is being trained by process {os.getpid()} on {socket.gethostname()}" in found.stderr

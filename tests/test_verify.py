@@ -23,7 +23,7 @@ from offbench.provenance import versions
 from offbench.rollout import Episode
 from offbench.survey import episodes_of
 from offbench.transitions import open_minari
-from offbench.verify import verify
+from offbench.verification import verify
 from tests.test_transitions import episode, foreign
 
 with warnings.catch_warnings():
@@ -448,7 +448,7 @@ def test_workers_find_the_same(medium: str, monkeypatch: pytest.MonkeyPatch) -> 
             shift_early(group)
 
     tamper(medium, edit)
-    monkeypatch.setattr("offbench.verify.FEW", 0)
+    monkeypatch.setattr("offbench.verification.FEW", 0)
     assert verify(medium, workers=2).findings == verify(medium, workers=1).findings
 
 
