@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 import shutil
 import warnings
@@ -68,13 +69,51 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
         OffbenchError: no such dataset (the nearest id is named), or its metadata are damaged.
     """
     path = root() / dataset_id / "data" / "metadata.json"
-    if dataset_id.startswith((".", "/")) or ".." in Path(dataset_id).parts or not path.exists():
+    if not exists(dataset_id):
         hint = "record one with `offbench collect ENV --level LEVEL`"
         raise OffbenchError(f"{unknown('dataset', dataset_id, local_ids())}; {hint}")
     metadata = read_json(path)
+    try:
+        _check_metadata(metadata)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise OffbenchError(f"{path} is damaged: {error}; record or download the dataset again") from None
+    return dict(metadata)
+
+
+TEXTS = ("env_spec", "eval_env_spec", "observation_space", "action_space", "algorithm_name", "description")
+NUMBERS = ("ref_min_score", "ref_max_score", "total_steps", "total_episodes")
+
+
+def _check_metadata(metadata: Any) -> None:
+    """Raise ValueError if a field that is read here is of another kind than it should be; all may be missing."""
     if not isinstance(metadata, dict):
-        raise OffbenchError(f"{path} is damaged: not a table; record or download the dataset again")
-    return metadata
+        raise ValueError("not a table")
+    for key in (*TEXTS, *NUMBERS):
+        value = metadata.get(key)
+        number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e15
+        if value is not None and not (isinstance(value, str) if key in TEXTS else number):
+            raise ValueError(f"{key} is {str(value)[:40]!r}")
+    for key in ("env_spec", "eval_env_spec"):
+        spec = json.loads(metadata.get(key) or "null")
+        if spec is not None and not (isinstance(spec, dict) and isinstance(spec.get("id"), str)):
+            raise ValueError(f"{key} names no environment")
+    ours = metadata.get(KEY)
+    if ours is None:
+        return
+    kinds = {"versions": dict, "references": dict, "imported": dict, "parts": list, "content_sha256": str}
+    for key, kind in kinds.items():
+        if not isinstance(ours, dict) or not isinstance(ours.get(key, kind()), kind):
+            raise ValueError(f"{KEY}.{key} is of another kind")
+    if not all(isinstance(part, dict) for part in ours.get("parts", [])):
+        raise ValueError(f"{KEY}.parts are of another kind")
+    if not all(isinstance(version, str) for version in ours.get("versions", {}).values()):
+        raise ValueError(f"{KEY}.versions are of another kind")
+
+
+def exists(dataset_id: str) -> bool:
+    """Return whether there is a local dataset of this id, sound or not."""
+    inside = not dataset_id.startswith((".", "/")) and ".." not in Path(dataset_id).parts and "\0" not in dataset_id
+    return inside and (root() / dataset_id / "data" / "metadata.json").exists()
 
 
 def provenance(metadata: dict[str, Any]) -> dict[str, Any]:

@@ -91,7 +91,7 @@ class Summary:
             f"return       mean {self.returns.mean():.1f}, std {self.returns.std():.1f}, "
             f"{self.returns.min():.1f} to {self.returns.max():.1f}",
         ]
-        if low is not None and high is not None:
+        if low is not None and high is not None and high > low:
             score = normalize(float(self.returns.mean()), float(low), float(high))
             lines.append(f"references   random {low:.1f}, expert {high:.1f}: normalized mean return {score:.1f}")
         lines += ["", *_histogram(self.returns), ""]

@@ -41,6 +41,7 @@ MEDIUM = 1 / 3  # of the expert's normalised return
 MEDIUM_AT_MOST = 0.45  # a rung beyond this is no medium while there is another
 CANDIDATES = 8  # late rungs that are measured to find the expert
 LOOKS = 6  # rungs that are measured to find the one nearest a return
+REFERENCE = ("return", "low", "high", "episodes")  # what each reference must have
 COLUMNS = ("step", "hours", "role", "policy", *MEASURES, *(f"deterministic_{m}" for m in MEASURES), "episodes")
 
 
@@ -116,10 +117,24 @@ def read_ladder(folder: Path) -> Ladder | None:
         with open(folder / "ladder.csv", newline="", encoding="utf-8") as file:
             rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
         ladder = Ladder(folder, info, rungs)
-        known = [ladder.random_return, ladder.expert_return, int(info["medium_replay"]["transitions"])]
+        known = [float(info["references"][name][key]) for name in ("random", "expert") for key in REFERENCE]
+        known += [int(info["medium_replay"]["transitions"]), int(info["levels"]["medium"])]
         if not (np.isfinite(known).all() and ladder.role("medium") and ladder.role("expert")):
             raise ValueError("its references are not numbers")
-    except (OSError, KeyError, ValueError, TypeError, AttributeError, StopIteration) as error:
+        if not ladder.random_return < ladder.expert_return or not isinstance(info["medium_replay"]["sha256"], str):
+            raise ValueError("its references are out of order, or medium-replay has no hash")
+        if not isinstance(info.get("versions", {}), dict):
+            raise ValueError("its versions are no table")
+    except (
+        OSError,
+        LookupError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        StopIteration,
+        OverflowError,
+        csv.Error,
+    ) as error:
         raise OffbenchError(
             f"the ladder in {folder} is damaged ({error!r}); delete it and build it again with `offbench behaviour`"
         ) from None

@@ -137,6 +137,11 @@ def open_minari(dataset_id: str) -> Any:
     if "observation_space" not in metadata or "action_space" not in metadata:
         # Minari would make the environment to ask it, running whatever code the file names
         raise OffbenchError(f"{dataset_id} cannot be read: its metadata lack a space; record or download it again")
+    size = sum(path.stat().st_size for path in (dataset.root() / dataset_id / "data").rglob("*") if path.is_file())
+    if not 0 <= (metadata.get("total_episodes") or 0) <= size:
+        raise OffbenchError(
+            f"{dataset_id} cannot be read: its files are too small for its episodes; download it again"
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import minari

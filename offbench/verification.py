@@ -46,9 +46,11 @@ def verify(dataset_id: str, *, episodes: int | None = None, workers: int | None 
     from offbench.transitions import open_minari  # here, because `verify --help` need not wait for Minari
 
     report, findings = Report(dataset_id), Findings()
-    metadata = dataset.read_metadata(dataset_id)
+    if not dataset.exists(dataset_id):
+        dataset.read_metadata(dataset_id)  # raises, and names the nearest id
     workers, episodes = default_workers(workers), EPISODES if episodes is None else episodes
     try:
+        metadata = dataset.read_metadata(dataset_id)
         data = open_minari(dataset_id)
     except OffbenchError as error:
         findings.add("unreadable", dataset_id, str(error))
