@@ -24,8 +24,9 @@ State = dict[str, Any]
 def save_checkpoint(folder: Path, step: int, tensors: dict[str, torch.Tensor], state: State) -> None:
     """Write checkpoint-<step>.safetensors, whole or not at all."""
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    about = {"offbench": json.dumps(state, sort_keys=True), "sha256": _sha256(whole, state)}
-    data = save(whole, metadata=about)
+    # one key, because safetensors writes several in any order, and a run's bytes should depend on the run alone
+    about = {**state, "sha256": _sha256(whole, state)}
+    data = save(whole, metadata={"offbench": json.dumps(about, sort_keys=True)})
     write_bytes(folder / f"checkpoint-{step:09d}.safetensors", data)
 
 
@@ -40,12 +41,12 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], S
     path = folder / f"checkpoint-{step:09d}.safetensors"
     try:
         with safe_open(path, framework="pt") as file:
-            about = file.metadata() or {}
-            state = json.loads(about["offbench"])
+            state = json.loads((file.metadata() or {})["offbench"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if not isinstance(state, dict) or state.get("step") != step:
             raise ValueError(f"it is not of step {step}")
-        if about.get("sha256") not in (None, _sha256(tensors, state)):  # older files have none
+        recorded = state.pop("sha256", None)  # older files have none
+        if recorded is not None and recorded != _sha256(tensors, state):
             raise ValueError("its content is not what was written (SHA-256)")
         return tensors, state
     except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError) as error:

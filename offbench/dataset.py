@@ -20,6 +20,7 @@ from offbench.errors import OffbenchError, unknown
 from offbench.files import disk_errors, read_json, sole
 from offbench.policy import Array
 from offbench.rollout import Episode
+from offbench.safefile import SafeFile, safe_file
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -186,8 +187,9 @@ def write(
                 warnings.simplefilter("ignore")
                 storage = MinariStorage.new(aside / "data", *(spaces or (None, None)), env_spec, "hdf5")
             _check_room(aside, storage, steps)
-            content = ContentHash()
-            storage.update_episodes(_buffers(episodes, storage.observation_space.dtype, content))
+            content, dtype = ContentHash(), storage.observation_space.dtype
+            with safe_file(storage._file_path) as storage._file_path:  # so that a full disk is no crash
+                storage.update_episodes(_buffers(episodes, dtype, content, storage._file_path))
             ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
             storage.update_metadata(metadata | {KEY: ours})
             if path.exists():
@@ -209,11 +211,14 @@ def _recover(path: Path) -> None:
     old = _old(path)
     if old.exists() and not path.exists():
         old.replace(path)
+    if old.is_symlink():
+        old.unlink()  # never what it leads to
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _buffers(episodes: Iterable[Episode], dtype: Any, content: ContentHash) -> Iterator[EpisodeBuffer]:
+def _buffers(episodes: Iterable[Episode], dtype: Any, content: ContentHash, file: SafeFile) -> Iterator[EpisodeBuffer]:
     for episode in episodes:
+        file.check()
         observations = episode.observations.astype(dtype, copy=False)
         ends = (episode.terminated, episode.truncated)
         content.add(observations, episode.actions, episode.rewards, ends)

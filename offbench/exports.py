@@ -8,9 +8,9 @@ npz    float32, the keys of D4RL's qlearning_dataset: what their replay buffers 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-import shutil
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -27,6 +27,7 @@ from offbench.errors import OffbenchError
 from offbench.files import disk_errors
 from offbench.policy import Array
 from offbench.progress import Progress
+from offbench.safefile import SafeFile, safe_file
 from offbench.survey import episodes_of
 from offbench.transitions import open_minari
 
@@ -36,6 +37,7 @@ TRAVELS = (  # Minari's metadata that go along
     *("ref_min_score", "ref_max_score", "num_episodes_average_score", dataset.KEY),
 )
 CHUNK = 16_384  # rows of a compressed piece
+PIECE = 1 << 20  # bytes copied at once
 ATTRIBUTE = 60_000  # bytes that HDF5 lets an attribute have
 
 Columns = dict[str, Array]
@@ -119,9 +121,10 @@ def _about(data: Any, metadata: dict[str, Any]) -> str:
 
 
 def _write_d4rl(path: Path, parts: Iterator[Columns], about: str) -> None:
-    with h5py.File(path, "w") as file:
+    with safe_file(path) as disk, h5py.File(disk, "w") as file:
         file.attrs["offbench"] = about
         for rows in _blocks(parts):
+            disk.check()
             for name, array in rows.items():
                 if name not in file:
                     options = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
@@ -164,21 +167,23 @@ def _write_npz(path: Path, parts: Iterator[Columns], drop_timeouts: bool, droppe
     Args:
         dropped: an import has left out the steps at timeouts already; what is flagged now is the step before.
     """
-    raw: dict[str, Any] = {}
     kinds: dict[str, tuple[Any, tuple[int, ...]]] = {}
     count = 0
-    try:
+    with contextlib.ExitStack() as stack:
+        raw: dict[str, SafeFile] = {}
         for part in parts:
             keep = np.ones(len(part["rewards"]), bool)
             if drop_timeouts:
                 keep = ~part["timeouts"] | (dropped & ~part["terminals"])
             for name, array in part.items():
                 if name not in raw:
-                    raw[name] = open(path.with_name(f"{name}.raw"), "w+b")  # noqa: SIM115 (closed below)
+                    raw[name] = stack.enter_context(safe_file(path.with_name(f"{name}.raw")))
                     kinds[name] = (array.dtype, array.shape[1:])
                 raw[name].write(np.ascontiguousarray(array[keep]).tobytes())
+                raw[name].check()
             count += int(keep.sum())
-        with zipfile.ZipFile(path, "w") as archive:
+        disk = stack.enter_context(safe_file(path))
+        with zipfile.ZipFile(disk, "w") as archive:
             for name, file in raw.items():
                 dtype, shape = kinds[name]
                 header = {
@@ -186,10 +191,10 @@ def _write_npz(path: Path, parts: Iterator[Columns], drop_timeouts: bool, droppe
                     "fortran_order": False,
                     "shape": (count, *shape),
                 }
+                size = file.seek(0, os.SEEK_END)
                 file.seek(0)
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array_header_1_0(member, header)
-                    shutil.copyfileobj(file, member)
-    finally:
-        for file in raw.values():
-            file.close()
+                    for first in range(0, size, PIECE):
+                        member.write(file.read(min(PIECE, size - first)))
+                        disk.check()

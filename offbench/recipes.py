@@ -133,8 +133,9 @@ def _kwargs(value: Any, where: str) -> tuple[tuple[str, Any], ...]:
     table = _table(value, "env_kwargs", where)
     try:
         json.dumps(table)
-    except (TypeError, ValueError):  # a date, a number of 5000 digits: no EnvSpec can carry them
-        raise OffbenchError(f"{where}: env_kwargs may hold numbers, text, true, false, lists and tables only") from None
+    except (TypeError, ValueError):  # a date, a number of 5000 digits
+        words = "numbers, text, true, false, lists and tables"
+        raise OffbenchError(f"{where}: env_kwargs may hold {words} only") from None
     return tuple(sorted(table.items()))
 
 

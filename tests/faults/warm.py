@@ -14,6 +14,9 @@ import time
 from pathlib import Path
 from typing import Any, NoReturn
 
+import minari  # noqa: F401
+import torch._dynamo  # noqa: F401 (what the first optimiser would import)
+
 import offbench.algos.td3_bc
 import offbench.d4rl
 import offbench.launch
@@ -21,6 +24,7 @@ import offbench.record
 import offbench.rollout
 import offbench.training
 from offbench.cli import main
+from offbench.environments import env_spec
 
 
 class HereRollouts(offbench.rollout.Rollouts):
@@ -53,6 +57,7 @@ def child(command: dict[str, Any]) -> NoReturn:
 
 def serve() -> None:
     """Answer commands until the input ends."""
+    env_spec("InvertedPendulum-v5")  # imports MuJoCo
     for line in sys.stdin:
         command = json.loads(line)
         began = time.perf_counter()
