@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from offbench.agents import behaviour
     from offbench.assess import evaluate
     from offbench.d4rl import import_d4rl
+    from offbench.deploy import export_policy
     from offbench.describe import inventory, show
     from offbench.exports import export
     from offbench.launch import train
@@ -36,6 +37,7 @@ __all__ = [
     "collect",
     "evaluate",
     "export",
+    "export_policy",
     "import_d4rl",
     "inventory",
     "load",
@@ -51,6 +53,7 @@ _VERBS = {
     "collect": ("offbench.record", "collect"),
     "evaluate": ("offbench.assess", "evaluate"),
     "export": ("offbench.exports", "export"),
+    "export_policy": ("offbench.deploy", "export_policy"),
     "import_d4rl": ("offbench.d4rl", "import_d4rl"),
     "inventory": ("offbench.describe", "inventory"),
     "load": ("offbench.transitions", "load"),

@@ -21,6 +21,7 @@ COMMANDS = {
     "verify": "check a dataset: its arrays, its metadata, and a sample of episodes played again",
     "import-d4rl": "turn a D4RL file (v0, v1, v2) into a Minari dataset",
     "export": "write a dataset as a D4RL file, or as arrays (npz)",
+    "export-policy": "write a run's policy as TorchScript",
     "card": "write an environment's dataset card from its five recorded levels",
 }
 
@@ -292,6 +293,18 @@ def _export(parser: Parser, _: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
+def _export_policy(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run directory or a policy file")
+    parser.add_argument("--out", required=True, metavar="FILE.pt", help="the file to write")
+
+    def run(**arguments: Any) -> None:
+        from offbench.deploy import export_policy
+
+        print(f"written to {export_policy(**arguments)}")
+
+    parser.set_defaults(run=run)
+
+
 def _card(parser: Parser, _: list[str]) -> None:
     parser.add_argument("env", metavar="ENV", help="a recipe with a ladder in the folder `behaviour` beside it")
     parser.add_argument("--out", metavar="DIR", help="where the card goes (default: <env>-card)")
@@ -315,6 +328,7 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "verify": _verify,
     "import-d4rl": _import,
     "export": _export,
+    "export-policy": _export_policy,
     "card": _card,
 }
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 import sys
 from collections.abc import Iterable, Iterator
@@ -41,6 +42,7 @@ MEDIUM = 1 / 3  # of the expert's normalised return
 MEDIUM_AT_MOST = 0.45  # a rung beyond this is no medium while there is another
 CANDIDATES = 8  # late rungs that are measured to find the expert
 LOOKS = 6  # rungs that are measured to find the one nearest a return
+POLICY_NAME = re.compile(r"\w[\w.-]*\.safetensors")  # a file of the ladder's own folder, nothing else
 REFERENCE = ("return", "low", "high", "episodes")  # what each reference must have
 COLUMNS = ("step", "hours", "role", "policy", *MEASURES, *(f"deterministic_{m}" for m in MEASURES), "episodes")
 
@@ -152,7 +154,7 @@ def shipped_references(env_id: str) -> tuple[float, float] | None:
 
 def _rung(row: dict[str, str]) -> Rung:
     mean, low, high = (float(row[key]) for key in ("return", "low", "high"))
-    if not np.isfinite([mean, low, high]).all() or "/" in row["policy"]:
+    if not np.isfinite([mean, low, high]).all() or not POLICY_NAME.fullmatch(row["policy"]):
         raise ValueError(f"rung {row['step']}")
     return Rung(int(row["step"]), row["role"], row["policy"], mean, low, high, int(row["episodes"]))
 

@@ -60,7 +60,8 @@ class Run:
                 raise OffbenchError(
                     f"{self.config_path} is damaged: it lacks {key}, or has an odd one; delete the run to repeat it"
                 )
-        for pair in (config["references"].get(name) for name in ("dataset", "d4rl")):
+        config["references"] = {name: config["references"].get(name) for name in ("dataset", "d4rl")}
+        for pair in config["references"].values():
             sound = isinstance(pair, list) and len(pair) == 2 and all(_is(value, float) for value in pair)
             if pair is not None and not (sound and pair[0] != pair[1]):
                 raise OffbenchError(f"{self.config_path} is damaged: odd references; delete the run to repeat it")

@@ -13,7 +13,7 @@ import io
 import json
 import pickle
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from offbench import checkpoints, dataset
-from offbench.describe import Summary, inventory_lines
+from offbench.describe import Summary
 from offbench.errors import OffbenchError
 from offbench.ladder import read_ladder
 from offbench.launch import references
@@ -187,7 +187,6 @@ def metadata(folder: Path, data: bytes) -> object:
     path = dataset.root() / "fuzzed-v0" / "data" / "metadata.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
-    inventory_lines()
     found = dataset.read_metadata("fuzzed-v0")
     empty: dict[str, Any] = dict.fromkeys(Transitions.__dataclass_fields__)
     flat = Transitions(**empty | {"dataset_id": "fuzzed-v0", "metadata": found})
@@ -398,15 +397,3 @@ def test_no_flipped_bit_is_another_number(name: str, home: Path) -> None:
                 continue
             assert str(found) == str(before), f"bit {bit}"
     assert refused > 4 * len(data)
-
-
-def _hdf5_cases(folder: Path, sound: Path, count: int) -> Iterator[Path]:
-    rng, data = np.random.default_rng(0), sound.read_bytes()
-    for i in range(count):
-        wounds = [
-            (str(rng.choice(["flip", "flip", "flip", "cut", "put", "drop"])), rng.random() ** 2, rng.bytes(8))
-            for _ in range(rng.integers(1, 4))
-        ]
-        path = folder / f"hopper_medium_{i}.hdf5"
-        path.write_bytes(wounded(data, wounds))
-        yield path
