@@ -23,7 +23,7 @@ from offbench.survey import episodes_of
 from offbench.transitions import open_minari
 from tests.conftest import ROOT
 
-KILLS = {"collect": 60, "overwrite": 40, "import": 20, "train": 100}  # at least 200 over collect and train
+KILLS = {"collect": 80, "overwrite": 60, "import": 40, "train": 100}  # at least 200 over collect and train
 RUN = ["--steps", "160", "--eval-every", "40", "--eval-episodes", "1", "--hidden", "16,16", "--batch-size", "16"]
 
 
@@ -55,8 +55,10 @@ class Warm:
 
     def close(self) -> None:
         assert self.process.stdin is not None
+        assert self.process.stdout is not None
         self.process.stdin.close()
         assert self.process.wait(timeout=60) == 0
+        self.process.stdout.close()
 
 
 @pytest.fixture
