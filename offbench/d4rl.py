@@ -91,7 +91,8 @@ def import_d4rl(file: str | Path, dataset_id: str, *, env: str | None = None, ov
             ends = _ends(source, LIMIT)
             metadata, spec, spaces = _metadata(source, recipe, env is not None, dataset_id)
             with dataset.claimed(dataset_id, overwrite) as place, Progress(len(source), f"importing {path}") as bar:
-                dataset.write(place, _episodes(source, ends, bar), spec, metadata, len(source), spaces)
+                known = metadata[dataset.KEY].get("content_sha256")
+                dataset.write(place, _episodes(source, ends, bar), spec, metadata, len(source), spaces, known)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # h5py raises all of these for damage
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise OffbenchError(f"{path} is not a readable D4RL file: {reason}") from None

@@ -167,6 +167,7 @@ def write(
     metadata: dict[str, Any],
     steps: int,
     spaces: tuple[gym.Space[Any], gym.Space[Any]] | None = None,
+    expected: str | None = None,
 ) -> str:
     """Write episodes as a Minari HDF5 dataset at `path`, whole or not at all; return the content hash.
 
@@ -176,6 +177,7 @@ def write(
         metadata: Minari's fields; the content hash joins those under the key `offbench`.
         steps: transitions to come, to see beforehand whether the disk has room.
         spaces: of observations and actions, where the environment is not to be asked (it may be no longer there).
+        expected: the content hash to come, where it is known; any other content is refused.
     """
     env_spec = EnvSpec.from_json(spec)
     aside, old = path.with_name(f".offbench-{path.name}.partial"), _old(path)
@@ -190,6 +192,10 @@ def write(
             content, dtype = ContentHash(), storage.observation_space.dtype
             with safe_file(storage._file_path) as storage._file_path:  # so that a full disk is no crash
                 storage.update_episodes(_buffers(episodes, dtype, content, storage._file_path))
+            if expected not in (None, content.hexdigest()):
+                raise OffbenchError(
+                    "the data are not those that were exported (their hash differs); export them again"
+                )
             ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
             storage.update_metadata(metadata | {KEY: ours})
             if path.exists():

@@ -324,6 +324,19 @@ def test_spoiled_files_are_one_clear_line(
     assert dataset.local_ids() == []
 
 
+def test_an_exported_file_that_was_changed_is_refused(
+    medium: str, home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It carries the content hash of the dataset."""
+    from tests.test_bad_input import refusal
+
+    export(medium, home / "out.hdf5")
+    with h5py.File(home / "out.hdf5", "a") as file:
+        file["rewards"][7] += 1e-9
+    assert "not those that were exported" in refusal(["import-d4rl", "out.hdf5", "--id", "back-v0"], capsys)
+    assert dataset.local_ids() == [medium]
+
+
 def test_metadata_in_a_file_run_no_code(medium: str, home: Path) -> None:
     """An env_spec that names os.system is kept as text and refused when somebody wants to play in it."""
     export(medium, home / "evil.hdf5")
