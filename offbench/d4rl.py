@@ -15,10 +15,8 @@ the metadata, under `offbench`. infos/ are left out.
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +24,9 @@ import gymnasium as gym
 import h5py
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from minari.serialization import deserialize_space
 
 from offbench import dataset
+from offbench.d4rlfile import NUMBERS, Source, read_source
 from offbench.environments import box, make_env
 from offbench.errors import OffbenchError
 from offbench.files import sha256_of
@@ -38,33 +36,10 @@ from offbench.provenance import versions
 from offbench.recipes import Recipe, d4rl_constants, load_recipe, names
 from offbench.rollout import Episode
 
-COLUMNS = ("observations", "actions", "rewards", "terminals")
-OPTIONAL = ("timeouts", "next_observations", "infos/seed")
 LIMIT = 1000  # steps of an episode of D4RL's MuJoCo tasks
 BLOCK = 65_536  # rows read at once
 ORIGINAL = {"Hopper": "Hopper-v2", "HalfCheetah": "HalfCheetah-v2", "Walker2d": "Walker2d-v2", "Ant": "Ant-v2"}
 LEVEL_WORDS = ("random", "medium", "expert", "mixed", "full")
-MOST_COMPRESSED = 1000  # times smaller than its numbers: no honest file is
-
-
-@dataclass(frozen=True)
-class Source:
-    """An opened D4RL file, its columns checked."""
-
-    path: Path
-    columns: dict[str, h5py.Dataset]
-    about: dict[str, Any]  # what `offbench export` added: Minari's metadata
-
-    def __len__(self) -> int:
-        return len(self.columns["rewards"])
-
-    def read(self, name: str, first: int, end: int) -> Array:
-        """Return rows [first, end) of a column; rewards and flags flat."""
-        rows: Array = self.columns[name][first:end]
-        return rows.reshape(len(rows)) if rows.ndim == 2 and name not in _WIDE else rows
-
-
-_WIDE = ("observations", "actions", "next_observations")
 
 
 def import_d4rl(file: str | Path, dataset_id: str, *, env: str | None = None, overwrite: bool = False) -> str:
@@ -86,7 +61,7 @@ def import_d4rl(file: str | Path, dataset_id: str, *, env: str | None = None, ov
     dataset.check_id(dataset_id)
     try:
         with h5py.File(path, "r") as opened:
-            source = _source(path, opened)
+            source = read_source(path, opened)
             recipe = _recipe(path, env, source)
             ends = _ends(source, LIMIT)
             metadata, spec, spaces = _metadata(source, recipe, env is not None, dataset_id)
@@ -97,79 +72,6 @@ def import_d4rl(file: str | Path, dataset_id: str, *, env: str | None = None, ov
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise OffbenchError(f"{path} is not a readable D4RL file: {reason}") from None
     return dataset_id
-
-
-def _source(path: Path, file: h5py.File) -> Source:
-    columns = {}
-    for name in (*COLUMNS, *OPTIONAL):
-        found = _own(path, file, name)
-        if found is not None:
-            columns[name] = found
-        elif name in COLUMNS:
-            raise OffbenchError(f"{path} is no D4RL file: it has no {name}")
-    _check(path, columns)
-    return Source(path, columns, _about(path, file))
-
-
-def _own(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
-    """Return a column of the file itself, None if there is none.
-
-    Every link is looked at before it is followed: it may lead to any file of this machine.
-    """
-    found: Any = file
-    for part in name.split("/"):
-        link = found.get(part, getlink=True)
-        if link is None:
-            return None
-        if not isinstance(link, h5py.HardLink):
-            raise OffbenchError(f"{path}: {name} is not data of this file")
-        found = found[part]
-    if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
-        raise OffbenchError(f"{path}: {name} is not data of this file")
-    return found
-
-
-def _check(path: Path, columns: dict[str, h5py.Dataset]) -> None:
-    """Refuse columns of other lengths, shapes and types, and those that claim more than the file can hold."""
-    rows = columns["observations"].shape[0] if columns["observations"].ndim == 2 else 0
-    if not rows:
-        raise OffbenchError(f"{path}: observations {columns['observations'].shape} are not rows of numbers")
-    for name, column in columns.items():
-        flat = column.shape in ((rows,), (rows, 1)) and name not in _WIDE
-        wide = column.ndim == 2 and column.shape[0] == rows and column.shape[1] > 0 and name in _WIDE
-        if not (flat or wide) or column.dtype.kind not in "fiub":
-            raise OffbenchError(f"{path}: {name} {column.shape} {column.dtype} does not fit {rows:,} rows")
-        if column.nbytes > MOST_COMPRESSED * (path.stat().st_size + 1000):
-            raise OffbenchError(f"{path}: {name} claims {column.nbytes / 1e9:.0f} GB, more than the file can hold")
-    if "next_observations" in columns and columns["next_observations"].shape != columns["observations"].shape:
-        raise OffbenchError(f"{path}: next_observations {columns['next_observations'].shape} differ from observations")
-
-
-def _about(path: Path, file: h5py.File) -> dict[str, Any]:
-    """Return the metadata that `offbench export` left in the file, checked; {} in anybody else's."""
-    text = file.attrs.get("offbench")
-    if text is None:
-        return {}
-    try:
-        about = json.loads(text)
-        known = {key: about[key] for key in (*_STRINGS, *_LISTS, *_NUMBERS, dataset.KEY) if key in about}
-        sound = all(isinstance(known.get(key, ""), str) for key in _STRINGS)
-        sound = sound and all(all(isinstance(item, str) for item in known.get(key, [])) for key in _LISTS)
-        sound = sound and all(math.isfinite(known.get(key, 0)) for key in _NUMBERS)
-        if not sound or not isinstance(known.get(dataset.KEY, {}), dict):
-            raise ValueError("a value of another type")
-        for key in ("env_spec", "eval_env_spec"):
-            if key in known:
-                EnvSpec.from_json(known[key])
-        kept = tuple(deserialize_space(known[key]) for key in ("observation_space", "action_space") if key in known)
-    except Exception as error:  # Gymnasium and Minari raise anything for JSON that is not theirs
-        raise OffbenchError(f"{path}: its offbench metadata are damaged ({error}); export the dataset again") from None
-    return known | {"spaces": kept}
-
-
-_STRINGS = ("env_spec", "eval_env_spec", "observation_space", "action_space", "algorithm_name", "description")
-_LISTS = ("author", "author_email", "requirements")
-_NUMBERS = ("ref_min_score", "ref_max_score", "num_episodes_average_score")
 
 
 def _recipe(path: Path, env: str | None, source: Source) -> Recipe | None:
@@ -225,7 +127,8 @@ def _episodes(source: Source, ends: dict[int, tuple[bool, bool]], progress: Prog
         group = [lasts[i]]
         while i + len(group) < len(lasts) and lasts[i + len(group)] - begin < BLOCK:
             group.append(lasts[i + len(group)])
-        names_ = [name for name in ("observations", "actions", "rewards", *OPTIONAL[1:]) if name in source.columns]
+        wanted = ("observations", "actions", "rewards", "next_observations", "infos/seed")
+        names_ = [name for name in wanted if name in source.columns]
         rows = {name: source.read(name, begin, group[-1] + 1) for name in names_}
         offset = begin
         for last in group:
@@ -259,7 +162,7 @@ def _metadata(
     """Return Minari's metadata, the EnvSpec the data were recorded in, and the spaces."""
     about, complete = source.about, "next_observations" in source.columns
     spec = about.get("env_spec") or _original(recipe)
-    known = {key: about[key] for key in (*_NUMBERS, "requirements") if key in about}
+    known = {key: about[key] for key in (*NUMBERS, "requirements") if key in about}
     known |= {key: set(about[key]) for key in ("author", "author_email") if key in about}
     evaluated = _evaluated(source, recipe, demanded) if recipe else about.get("eval_env_spec")
     env_id = str(json.loads(spec)["id"])
