@@ -49,11 +49,13 @@ def verify(dataset_id: str, *, episodes: int | None = None, workers: int | None 
     if not dataset.exists(dataset_id):
         dataset.read_metadata(dataset_id)  # raises, and names the nearest id
     workers, episodes = default_workers(workers), EPISODES if episodes is None else episodes
+    code = "metadata"
     try:
         metadata = dataset.read_metadata(dataset_id)
+        code = "unreadable"
         data = open_minari(dataset_id)
     except OffbenchError as error:
-        findings.add("unreadable", dataset_id, str(error))
+        findings.add(code, dataset_id, str(error))
         return dataclasses.replace(report, findings=findings.all())
     box(data.observation_space, f"{dataset_id}: observations")
     box(data.action_space, f"{dataset_id}: actions")
