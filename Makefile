@@ -25,5 +25,15 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+# Speed against others and against the machine, into docs/benchmarks.md. d3rlpy has an environment of its own.
+bench: $(STAMP) .venv-d3rlpy/bin/python
+	$(BIN)/python -m pip install -q -c constraints.txt "minari[create]"
+	$(BIN)/python -m tests.speed
+
+.venv-d3rlpy/bin/python:
+	$(PYTHON) -m venv .venv-d3rlpy
+	grep -E "^(torch|numpy)==" constraints.txt > .venv-d3rlpy/pins.txt
+	.venv-d3rlpy/bin/python -m pip install -q -c .venv-d3rlpy/pins.txt d3rlpy==2.8.1
+
 clean:
-	rm -rf $(VENV) build dist *.egg-info demo
+	rm -rf $(VENV) .venv-d3rlpy build dist *.egg-info demo

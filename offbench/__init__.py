@@ -7,6 +7,7 @@
     runs = offbench.train("bdb", dataset_id, seeds=range(5), beta=0.5)
     offbench.evaluate(runs[0]).scores
     offbench.normalize()                                    # every run below ./runs
+    offbench.report()                                       # the same as a page, report/index.html
 
 The command line (`offbench --help`) calls these same functions.
 """
@@ -21,12 +22,14 @@ from offbench.errors import OffbenchError
 if TYPE_CHECKING:
     from offbench.agents import behaviour
     from offbench.assess import evaluate
+    from offbench.comparison import compare
     from offbench.d4rl import import_d4rl
     from offbench.deploy import export_policy
     from offbench.describe import inventory, show
     from offbench.exports import export
     from offbench.launch import train
     from offbench.record import collect
+    from offbench.reporting import report
     from offbench.tables import normalize_runs_or_returns as normalize
     from offbench.transitions import load
     from offbench.verification import verify
@@ -35,6 +38,7 @@ __all__ = [
     "OffbenchError",
     "behaviour",
     "collect",
+    "compare",
     "evaluate",
     "export",
     "export_policy",
@@ -42,6 +46,7 @@ __all__ = [
     "inventory",
     "load",
     "normalize",
+    "report",
     "show",
     "train",
     "verify",
@@ -51,6 +56,7 @@ __all__ = [
 _VERBS = {
     "behaviour": ("offbench.agents", "behaviour"),
     "collect": ("offbench.record", "collect"),
+    "compare": ("offbench.comparison", "compare"),
     "evaluate": ("offbench.assess", "evaluate"),
     "export": ("offbench.exports", "export"),
     "export_policy": ("offbench.deploy", "export_policy"),
@@ -58,6 +64,7 @@ _VERBS = {
     "inventory": ("offbench.describe", "inventory"),
     "load": ("offbench.transitions", "load"),
     "normalize": ("offbench.tables", "normalize_runs_or_returns"),
+    "report": ("offbench.reporting", "report"),
     "show": ("offbench.describe", "show"),
     "train": ("offbench.launch", "train"),
     "verify": ("offbench.verification", "verify"),

@@ -6,6 +6,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from json import dumps
 from typing import Any, NoReturn
 
 from offbench.errors import OffbenchError, unknown
@@ -13,7 +14,10 @@ from offbench.errors import OffbenchError, unknown
 COMMANDS = {
     "collect": "record a dataset: random, medium, medium-replay, medium-expert, expert, or a fraction",
     "train": "train an algorithm on a dataset, with evaluations as it goes",
+    "benchmark": "a whole grid: datasets x algorithms x settings x seeds, resumable",
     "normalize": "the score table of all runs, or the scores of given returns",
+    "report": "all runs as one page, with tables and figures as files",
+    "compare": "two methods over the datasets and seeds that both have, with a verdict",
     "evaluate": "play a run's policy, or a policy file",
     "behaviour": "train an environment's behaviour agent (SAC) and build its ladder",
     "list": "environments, levels, algorithms and local datasets",
@@ -24,6 +28,7 @@ COMMANDS = {
     "export-policy": "write a run's policy as TorchScript",
     "card": "write an environment's dataset card from its five recorded levels",
 }
+SWITCHES = ("--tf32", "--tensorboard")  # flags of `train` without a value: the algorithm may follow them
 
 
 class Parser(argparse.ArgumentParser):
@@ -129,17 +134,16 @@ def _train(parser: Parser, words: list[str]) -> None:
     from offbench.settings import fields
 
     parser.add_argument("algorithm", metavar="ALGO", help=f"one of {', '.join(algorithm_names())}")
-    parser.add_argument(
-        "--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets of one environment"
-    )
+    parser.add_argument("--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets")
     parser.add_argument("--seeds", type=seed_list, default=[0], metavar="LIST", help="3, 0,1,2 or 0:5 (default: 0)")
     parser.add_argument("--steps", type=whole, default=1_000_000, help="updates (default: 1,000,000)")
     parser.add_argument("--eval-every", type=whole, default=5_000, help="updates between evaluations (default: 5,000)")
     parser.add_argument("--eval-episodes", type=whole, default=10, help="episodes of an evaluation (default: 10)")
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
-    parser.add_argument("--workers", type=whole, help="evaluation processes (default: all cores but one)")
-    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
-    positions = [word for before, word in zip(["", *words], words, strict=False) if not before.startswith("--")]
+    _machine(parser)
+    parser.add_argument("--tensorboard", action="store_true", help="write event files beside each run")
+    parser.add_argument("--wandb", metavar="PROJECT", help="show the runs in a Weights & Biases project")
+    pairs = zip(["", *words], words, strict=False)
+    positions = [word for before, word in pairs if not before.startswith("--") or before in SWITCHES]
     algorithm = next((word for word in positions if not word.startswith("-")), None)
     if algorithm is None:
         parser.epilog = "`offbench train ALGO --help` shows the algorithm's own settings."
@@ -166,6 +170,55 @@ def _train(parser: Parser, words: list[str]) -> None:
         for folder in folders:
             print(folder)
         print(f"next: offbench normalize --runs {rest['runs']}")
+
+    parser.set_defaults(run=run)
+
+
+def _machine(parser: Parser) -> None:
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
+    parser.add_argument("--workers", type=whole, help="processes for training and evaluation (default: one a core)")
+    parser.add_argument("--stack", type=auto, default="auto", help="most runs that train as one program (auto or N)")
+    parser.add_argument("--tf32", action="store_true", help="on a GPU: faster, less precise matrix products")
+    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+
+
+def _benchmark(parser: Parser, words: list[str]) -> None:
+    from offbench.grid import shipped_grids
+
+    parser.add_argument("grid", metavar="GRID", help=f"{', '.join(shipped_grids())}, or a grid file")
+    parser.add_argument("--plan", action="store_true", help="print runs, cost and disk, and do nothing")
+    parser.add_argument("--budget", metavar="TIME", help="stop cleanly after 90s, 9m or 2h; the same command goes on")
+    parser.add_argument("--shard", type=share, default=(0, 1), metavar="I/N", help="the I-th of N shares, I from 0")
+    parser.add_argument("--executor", choices=("local", "ray"), default="local", help="default: local processes")
+    parser.add_argument(
+        "--address", help="of the Ray cluster, e.g. auto or ray://head:10001 (default: start one here)"
+    )
+    _machine(parser)
+
+    def run(
+        plan: bool,
+        budget: str | None,
+        shard: tuple[int, int],
+        executor: str,
+        address: str | None,
+        **arguments: Any,
+    ) -> None:
+        from offbench import benchmark, tables
+
+        if plan:
+            print("\n".join(benchmark.plan(benchmark.prepare(**arguments))))
+            return
+        command = shlex.join(["offbench", "benchmark", *words])
+        where = None
+        if executor == "ray":
+            from offbench.cluster import RayExecutor
+
+            where = RayExecutor(address)
+            arguments["workers"] = arguments["workers"] or where.cpus
+        finished = benchmark.benchmark(**arguments, budget=budget, shard=shard, executor=where, command=command)
+        print(tables.render(tables.score_runs(arguments["runs"])))
+        if not finished:
+            print("stopped at the budget; the same command goes on", file=sys.stderr)
 
     parser.set_defaults(run=run)
 
@@ -218,6 +271,33 @@ def _normalize(parser: Parser, _: list[str]) -> None:
             from offbench.plots import plot_curves
 
             print(f"curves in {plot_curves(arguments['runs'], plot)}", file=sys.stderr)
+
+    parser.set_defaults(run=run)
+
+
+def _report(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+    parser.add_argument("--out", default="report", metavar="DIR", help="where the report goes (default: report)")
+
+    def run(**arguments: Any) -> None:
+        from offbench.reporting import report
+
+        print(f"report in {report(**arguments)}")
+
+    parser.set_defaults(run=run)
+
+
+def _compare(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("a", metavar="A", help="a group of runs: ALGO or ALGO/VARIANT, e.g. td3_bc")
+    parser.add_argument("b", metavar="B", help="the other one, e.g. bdb/beta=0.5")
+    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+    def run(json: bool, **arguments: Any) -> None:
+        from offbench.comparison import compare
+
+        found = compare(**arguments)
+        print(dumps(found.row(), indent=1) if json else "\n".join(found.lines()))
 
     parser.set_defaults(run=run)
 
@@ -320,7 +400,10 @@ def _card(parser: Parser, _: list[str]) -> None:
 ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "collect": _collect,
     "train": _train,
+    "benchmark": _benchmark,
     "normalize": _normalize,
+    "report": _report,
+    "compare": _compare,
     "evaluate": _evaluate,
     "behaviour": _behaviour,
     "list": _list,
@@ -338,6 +421,11 @@ def whole(text: str) -> int:
     return _whole(text, 1)
 
 
+def auto(text: str) -> int | str:
+    """Return "auto" or a whole number from 1."""
+    return text if text == "auto" else whole(text)
+
+
 def natural(text: str) -> int:
     """Return a whole number from 0."""
     return _whole(text, 0)
@@ -351,6 +439,14 @@ def _whole(text: str, least: int) -> int:
     except (ValueError, OverflowError):
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}") from None
     return int(value)
+
+
+def share(text: str) -> tuple[int, int]:
+    """Return (i, n) of `i/n`."""
+    first, slash, last = text.partition("/")
+    if not slash:
+        raise argparse.ArgumentTypeError(f"{text!r} is no share like 0/4")
+    return natural(first), whole(last)
 
 
 def number(text: str) -> float:

@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from filelock import FileLock, Timeout
 from gymnasium.envs.registration import EnvSpec
 
 from offbench.errors import OffbenchError, unknown
@@ -141,6 +142,23 @@ class ContentHash:
         return self._hash.hexdigest()
 
 
+def being_recorded(dataset_id: str) -> bool:
+    """Whether another process holds a dataset id for writing."""
+    path = path_of(dataset_id)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(_lock_path(path))
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        return True
+    lock.release()
+    return False
+
+
+def _lock_path(path: Path) -> Path:
+    return path.parent / f".offbench-{path.name}.lock"
+
+
 @contextlib.contextmanager
 def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     """Hold a dataset id for writing; yields its folder.
@@ -152,7 +170,7 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     path = path_of(dataset_id)
     if not path.parent.resolve().is_relative_to(root().resolve()):
         raise OffbenchError(f"{dataset_id} leads out of {root()} by a link; choose another id")
-    with sole(path.parent / f".offbench-{path.name}.lock", f"{dataset_id} is being recorded"):
+    with sole(_lock_path(path), f"{dataset_id} is being recorded"):
         with disk_errors(str(path)):
             _recover(path)
         if path.exists() and not overwrite:

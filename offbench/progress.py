@@ -32,6 +32,14 @@ class Progress:
         elif kind is None and self.done > self._first:
             self._print()
 
+    def skip(self, done: int) -> None:
+        """Take in `done` units that were done before, so that they do not count as speed."""
+        self.done += done
+        self._first += done
+        if self._bar is not None:
+            self._bar.initial += done
+            self._bar.update(done)
+
     def to(self, done: int, note: str = "") -> None:
         """Say that `done` units are done, with a note such as the last score."""
         step, self.done, self._note = done - self.done, done, note or self._note

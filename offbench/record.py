@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from offbench.card import compare
 from offbench.environments import make_env
 from offbench.errors import OffbenchError
 from offbench.files import sha256
+from offbench.grid import Source
 from offbench.ladder import MEDIUM, MEDIUM_AT_MOST, Ladder, Rung, read_ladder
 from offbench.levels import Part, parse_level, parse_mix, shares
 from offbench.policy import Policy, uniform
@@ -25,6 +27,7 @@ from offbench.replay import load_replay
 from offbench.rollout import Episode, Rollouts
 from offbench.workers import default_workers
 
+WAIT = 5.0  # seconds between two looks at a dataset that another process records
 HOME = "https://github.com/offbench/offbench"
 
 
@@ -81,6 +84,29 @@ def collect(
     if seed == 0 and steps is None and not retrain and (said := compare(recipe, name, content)):
         print(f"offbench: {said}", file=sys.stderr)
     return dataset_id
+
+
+def record_source(source: Source, workers: int) -> None:
+    """Record a grid's dataset, or wait for the process that is at it.
+
+    Raises:
+        OffbenchError: it is no level of a known environment, or cannot be recorded.
+    """
+    if not source.env:
+        raise OffbenchError(
+            f"{source.id} is no local dataset and no level of a known environment; "
+            "record or download it, or write its env and level into the grid"
+        )
+    while source.id not in dataset.local_ids():
+        try:
+            collect(
+                source.env, source.level, steps=source.steps, seed=source.seed, workers=workers, dataset_id=source.id
+            )
+        except OffbenchError:
+            # another process is at it, or has just done it
+            if not dataset.being_recorded(source.id) and source.id not in dataset.local_ids():
+                raise
+            time.sleep(WAIT)
 
 
 def _ladder(recipe: Recipe, behaviour_dir: Path, retrain: bool, workers: int) -> Ladder:

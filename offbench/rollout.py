@@ -199,7 +199,7 @@ class Rollouts:
         self._pool: ProcessPoolExecutor | None = None
         if workers:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(workers, context, _start_worker, (os.getpid(),))
+            self._pool = ProcessPoolExecutor(workers, context, start_worker, (os.getpid(),))
 
     def __enter__(self) -> Rollouts:
         return self
@@ -215,7 +215,7 @@ class Rollouts:
     def call(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """Start a module's function in a worker process, or run it now if there is none."""
         if self._pool:
-            with _quiet_start():
+            with quiet_start():
                 try:
                     return self._pool.submit(function, *arguments)
                 except BrokenProcessPool:
@@ -298,7 +298,7 @@ def _gather(futures: Sequence[Future[Any]]) -> Future[list[Outcome]]:
 
 
 @contextlib.contextmanager
-def _quiet_start() -> Iterator[None]:
+def quiet_start() -> Iterator[None]:
     """Let a worker start undisturbed: submitting a task may start one.
 
     Ctrl-C is held back meanwhile (half a start would leave the pool unusable), and the user's script is hidden: a
@@ -321,7 +321,7 @@ def _quiet_start() -> Iterator[None]:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_worker(parent: int) -> None:
+def start_worker(parent: int) -> None:
     """Leave Ctrl-C to the parent, and end when the parent is gone (even by kill -9)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()

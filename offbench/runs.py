@@ -6,6 +6,7 @@ runs/<dataset>/<algorithm>/<variant>/seed-<n>/
     losses.csv            step and the mean of each logged quantity since the row before
     policy.safetensors    the policy at the last checkpoint
     checkpoint-*.safetensors   the newest two; the same command goes on from there
+    diverged.json         only where a run became NaN or infinite: at which step, in which tensor
 """
 
 from __future__ import annotations
@@ -83,6 +84,15 @@ class Run:
                     )
             config = {**known, "steps": max(int(config["steps"]), int(known["steps"]))}
         write_json(self.config_path, config)
+
+    def mark_diverged(self, step: int, tensor: str) -> None:
+        """Note that the run cannot go on: `tensor` held NaN or infinity at `step`."""
+        write_json(self.folder / "diverged.json", {"step": step, "tensor": tensor})
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the run is marked so; it is not trained on until that file is deleted."""
+        return (self.folder / "diverged.json").exists()
 
     def evaluations(self) -> dict[int, list[tuple[float, int]]]:
         """Return {step: [(return, length) of each episode]} in order of steps; {} if there are none yet.

@@ -24,6 +24,7 @@ class Purpose(IntEnum):
     CHUNK = 8  # batches and noise of chunk i of a run
     EVALUATION = 9  # the episodes of a run's evaluation at step i
     SAMPLE = 11  # which transitions or episodes a picture or a check looks at
+    BOOTSTRAP = 12  # the resampled seeds behind an interval
 
 
 def sequence(seed: int, purpose: Purpose, *index: int) -> np.random.SeedSequence:

@@ -16,6 +16,7 @@ from offbench.ladder import read_ladder
 from offbench.recipes import load_recipe
 from offbench.runs import Run, find_runs
 from offbench.scores import LAST, mean_std, normalize, run_return
+from offbench.statistics import iqm
 
 Row = dict[str, Any]
 FORMATS = ("table", "json", "csv", "markdown", "latex")
@@ -25,7 +26,8 @@ def score_runs(runs: str | Path = "runs") -> list[Row]:
     """Return one row for each (dataset, algorithm, variant) below a folder, seeds averaged.
 
     A run's score is the mean of its last 10 evaluations; a row has the mean and the standard deviation over
-    seeds, normalised by the dataset's own reference (`score`) and by D4RL's constants (`d4rl_score`).
+    seeds, normalised by the dataset's own reference (`score`) and by D4RL's constants (`d4rl_score`), and the
+    interquartile mean of `score` with its 95% bootstrap interval (`iqm`, in JSON and CSV).
 
     Raises:
         OffbenchError: the folder holds no evaluated run, or a damaged one.
@@ -52,6 +54,10 @@ def _row(dataset: str, algorithm: str, variant: str, group: list[tuple[Run, dict
         scores = [normalize(r, *pair) for r, pair in zip(returns, pairs, strict=True) if pair]
         mean, std = mean_std(scores) if len(scores) == len(returns) else (None, None)
         row |= {column: mean, f"{column}_std": std}
+        if reference == "dataset":
+            middle = iqm({dataset: scores}) if mean is not None else None
+            ends = (middle.low, middle.high) if middle else (None, None)
+            row |= {"iqm": middle.value if middle else None, "iqm_low": ends[0], "iqm_high": ends[1]}
     return row
 
 
@@ -122,6 +128,9 @@ TITLES = {
     "of_steps": None,  # shown as 50,000/1,000,000 in the steps column
     "score": "score (own ref.)",
     "score_std": None,
+    "iqm": None,  # of one dataset's few seeds it is near the mean: for programs, not for the eye
+    "iqm_low": None,
+    "iqm_high": None,
     "d4rl_score": "score (D4RL ref.)",
     "d4rl_score_std": None,
 }

@@ -66,6 +66,14 @@ class Transitions:
         """The environment's id, for the policy file; empty if the dataset does not name one."""
         return str(json.loads(self.env_spec).get("id", "")) if self.env_spec else ""
 
+    @property
+    def references(self) -> tuple[float, float] | None:
+        """The dataset's own reference returns (random, expert); None if it has none."""
+        low, high = self.metadata.get("ref_min_score"), self.metadata.get("ref_max_score")
+        if low is None or high is None or not float(high) > float(low):
+            return None
+        return float(low), float(high)
+
     def best(self, share: float) -> Array:
         """Return the indices of the transitions of the best `share` of all episodes by return, in order."""
         count = max(1, round(share * len(self.ends)))

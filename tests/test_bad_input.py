@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import warnings
 from pathlib import Path
 from typing import Any
@@ -79,6 +78,11 @@ CASES: dict[str, tuple[str, str]] = {
     "normalize --env hopper abc": ("'abc' is not a number", ""),
     "normalize --env hopper nan": ("returns must be finite numbers", ""),
     "normalize --format html": ("invalid choice: 'html'", ""),
+    "report --runs nowhere": ("no evaluated runs below nowhere", "offbench train"),
+    "compare td3_bc": ("the following arguments are required: B", "--help"),
+    "compare td3_bc cql --runs nowhere": ("no evaluated runs below nowhere", ""),
+    "train --tensorboard td3_bc --dataset x-v0": ("unknown dataset 'x-v0'", ""),
+    "train td3_bc --dataset MEDIUM --wandb": ("argument --wandb: expected one argument", ""),
     "show x-v0": ("unknown dataset 'x-v0'", ""),
     "show MEDIM": ("did you mean 'tiny-medium-v0'?", ""),
     "show MEDIUM --plot out.gif": ("a picture's name must end in .png, .svg, .pdf, not 'out.gif'", ""),
@@ -232,25 +236,6 @@ def test_a_full_disk_is_seen_before_recording(
     assert "not enough room" in line
     assert "MINARI_DATASETS_PATH" in line
     assert dataset.local_ids() == []
-
-
-def test_datasets_of_different_shapes_do_not_stack(medium: str) -> None:
-    foreign("other-v0", [episode(3, 0, True)])
-    with pytest.raises(offbench.OffbenchError, match="one stack must have the same shapes"):
-        offbench.train("td3_bc", [medium, "other-v0"], steps=10, hidden=(8,))
-
-
-def test_datasets_of_different_environments_do_not_stack(tiny: tuple[str, str], medium: str, home: Path) -> None:
-    """The same shapes, another time limit: evaluations and references would be mixed up."""
-    path = home / "minari" / medium / "data" / "metadata.json"
-    shutil.copytree(home / "minari" / medium, home / "minari" / "longer-v0")
-    metadata = json.loads(path.read_text())
-    spec = json.loads(metadata["eval_env_spec"]) | {"max_episode_steps": 500}
-    changed = metadata | {"eval_env_spec": json.dumps(spec), "dataset_id": "longer-v0"}
-    (home / "minari" / "longer-v0" / "data" / "metadata.json").write_text(json.dumps(changed))
-    with pytest.raises(offbench.OffbenchError, match="must be of one environment"):
-        offbench.train("td3_bc", [medium, "longer-v0"], steps=10, hidden=(8,))
-    assert not list(home.glob("runs/**/config.json"))
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def test_importance_weights_estimate_the_integral_over_actions() -> None:
 
 
 def test_uniform_actions_cover_both_signs() -> None:
-    from offbench.training import CHUNK, draw_chunk
+    from offbench.batches import CHUNK, draw_chunk
 
     algorithm = make()
     _, noise = draw_chunk([0], [50], BATCH, algorithm.draws, 0, torch.device("cpu"))

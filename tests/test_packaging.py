@@ -42,6 +42,10 @@ def test_wheel_and_sdist_carry_recipes_weights_and_algorithms(built: Path) -> No
     for name in shipped():
         assert f"offbench/{name}" in in_wheel
         assert f"offbench/{name}" in in_sdist
+    for folder in ("assets", "published"):
+        for path in (ROOT / "offbench" / folder).iterdir():
+            assert f"offbench/{folder}/{path.name}" in in_wheel
+            assert f"offbench/{folder}/{path.name}" in in_sdist
     for path in (ROOT / "algos").glob("*.py"):
         assert f"offbench/algos/{path.name}" in in_wheel
     assert not {name for name in in_wheel if name.startswith(("algos/", "datasets/", "tests/"))}
@@ -67,6 +71,7 @@ def test_a_clean_install_works_outside_the_repository(built: Path, tmp_path: Pat
     run("collect", "inverted-pendulum", "--level", "medium", "--steps", "2000")
     run("train", "bdb", "--dataset", "inverted-pendulum-medium-v0", "--steps", "20", "--eval-every", "10")
     assert "bdb" in run("normalize")
+    assert "index.html" in run("report")
     for name in ("algos", "datasets"):
         code = f"import importlib.util, sys; sys.exit(importlib.util.find_spec({name!r}) is not None)"
         assert subprocess.run([str(python), "-c", code], cwd=tmp_path, env=environment).returncode == 0, name

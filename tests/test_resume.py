@@ -23,7 +23,7 @@ from offbench.recipes import load_recipe
 from offbench.registry import algorithm_names
 from offbench.runs import Run
 
-SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 100, "eval_episodes": 2}
+SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 100, "eval_episodes": 2, "workers": 1}
 EXTRA: dict[str, dict[str, Any]] = {
     "td3_bc": {},
     "bdb": {},

@@ -83,6 +83,9 @@ def test_the_table_of_runs_by_hand() -> None:
     assert two["score"] == 40.0
     assert two["score_std"] == pytest.approx(np.std([50.0, 30.0], ddof=1))
     assert two["d4rl_score"] == 45.0
+    # two seeds, 50 and 30: the mean resamples to 30, 40, 50 with 1/4, 1/2, 1/4
+    assert (two["iqm"], two["iqm_low"], two["iqm_high"]) == (40.0, 30.0, 50.0)
+    assert (one["iqm"], one["iqm_low"], one["iqm_high"]) == (100.0, None, None)
 
 
 def test_returns_of_an_environment() -> None:

@@ -1,0 +1,307 @@
+"""`benchmark`: a whole grid, from missing datasets to the score table; stopped at any point, it goes on.
+
+grid -> plan: runs, stacks, expected hours, disk
+     -> datasets that are missing are recorded
+     -> runs cut into parts -> a shard's parts -> what is left of them -> jobs -> an executor
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from offbench import checkpoints, dataset
+from offbench.calibrate import Rate, measure, step_seconds
+from offbench.devices import pick_device
+from offbench.errors import OffbenchError
+from offbench.grid import Entry, Grid, Source, Times, load_grid
+from offbench.jobs import Job, Order, run_jobs
+from offbench.launch import configurations
+from offbench.levels import parse_level
+from offbench.progress import duration
+from offbench.recipes import Recipe, load_recipe
+from offbench.record import record_source
+from offbench.registry import load_algorithm
+from offbench.runs import run_folder, settings_dict, variant
+from offbench.stacking import Part, cut, pending, with_evaluators
+from offbench.training import Schedule
+from offbench.workers import default_workers
+
+UNITS = {"s": 1, "m": 60, "h": 3600}
+
+
+class Executor(Protocol):
+    """Where recordings and trainings happen."""
+
+    def record(self, sources: Sequence[Source], workers: int) -> None:
+        """Record datasets. Raises OffbenchError if one cannot be."""
+        ...
+
+    def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
+        """Train jobs as far as their deadline; return what went wrong, a line each."""
+        ...
+
+
+class LocalExecutor:
+    """This machine's processes."""
+
+    def __init__(self, deadline: float | None = None) -> None:
+        self.deadline = deadline
+
+    def record(self, sources: Sequence[Source], workers: int) -> None:
+        """Record datasets, one after the other, until the deadline."""
+        for source in sources:
+            if self.deadline is None or time.time() < self.deadline:
+                record_source(source, workers)
+
+    def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
+        """Train jobs in so many processes."""
+        return run_jobs(jobs, processes)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One algorithm with one set of settings: a column of the table."""
+
+    algorithm: str
+    config: Any
+    times: Times
+
+    @property
+    def name(self) -> str:
+        """Algorithm and settings in words."""
+        return f"{self.algorithm} {variant(self.config)}".removesuffix(" default")
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A grid at one place: what `plan` describes and `run` does."""
+
+    grid: Grid
+    variants: tuple[Variant, ...]
+    runs: Path
+    device: str
+    workers: int
+    tf32: bool = False
+    stack: int | str = "auto"
+
+    @property
+    def processes(self) -> int:
+        """Stacks that train at a time."""
+        return self.workers if self.device == "cpu" else 1
+
+    def orders(self, one: Variant) -> list[Order]:
+        """Return a variant's runs on every dataset."""
+        settings, name = settings_dict(one.config), variant(one.config)
+        return [
+            Order(
+                one.algorithm,
+                source.id,
+                settings,
+                seed,
+                str(run_folder(self.runs, source.id, one.algorithm, name, seed)),
+            )
+            for source in self.grid.datasets
+            for seed in one.times.seeds
+        ]
+
+    def missing(self) -> list[Source]:
+        """Return the datasets that are not recorded yet."""
+        here = set(dataset.local_ids())
+        return [source for source in self.grid.datasets if source.id not in here]
+
+
+def benchmark(
+    grid: str,
+    *,
+    runs: str | Path = "runs",
+    device: str = "auto",
+    workers: int | None = None,
+    stack: int | str = "auto",
+    tf32: bool = False,
+    budget: str | None = None,
+    shard: tuple[int, int] = (0, 1),
+    executor: Executor | None = None,
+    command: str = "",
+    say: Callable[[str], None] = print,
+) -> bool:
+    """Run a grid to its end, or as far as the budget allows; finished parts are left alone.
+
+    Args:
+        grid: a shipped grid's name (paper, paper-small, smoke) or a file (`./mine.toml`).
+        runs: the folder of all run directories.
+        device, workers, stack, tf32: as in `train`.
+        budget: "9m", "2h" or "90s": stops cleanly after that time; the same call goes on.
+        shard: (i, n): the i-th of n shares of the stacks, for machines with a shared file system.
+        executor: where it happens: this machine (default), or a cluster (offbench.cluster.RayExecutor).
+        command: what the user typed, for each run's config.json.
+        say: takes the plan, line by line.
+
+    Returns:
+        Whether the grid (of this shard) is finished.
+
+    Raises:
+        OffbenchError: anything that the user can mend; runs that diverged, once all others are done.
+    """
+    deadline = time.time() + _seconds(budget) if budget else None
+    executor = executor or LocalExecutor(deadline)
+    bench = prepare(grid, runs=runs, device=device, workers=workers, stack=stack, tf32=tf32)
+    for line in plan(bench):
+        say(line)
+    executor.record(bench.missing(), bench.workers)
+    if bench.missing():
+        return False  # out of time
+    parts = _parts(bench, shard)
+    jobs = [
+        job
+        for part, schedule in parts
+        for job in pending(part, replace(schedule, deadline=deadline), tf32=tf32, command=command)
+    ]
+    if bench.device != "cpu":
+        jobs = with_evaluators(jobs, bench.workers)
+    problems = executor.train(jobs, bench.processes) if jobs else []
+    if problems:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise OffbenchError(problems[0] + more)
+    return not any(pending(part, schedule, tf32=tf32, command=command) for part, schedule in parts)
+
+
+def prepare(
+    grid: str,
+    *,
+    runs: str | Path = "runs",
+    device: str = "auto",
+    workers: int | None = None,
+    stack: int | str = "auto",
+    tf32: bool = False,
+) -> Benchmark:
+    """Read and check a grid. Raises OffbenchError for anything wrong in it."""
+    read = load_grid(grid)
+    variants = [Variant(e.algorithm, config, e.times) for e in read.entries for config in _configs(e)]
+    if len({(v.algorithm, variant(v.config)) for v in variants}) < len(variants):
+        raise OffbenchError(f"{read.name}: an algorithm with the same settings comes twice")
+    if len({source.id for source in read.datasets}) < len(read.datasets):
+        raise OffbenchError(f"{read.name}: a dataset comes twice")
+    place = pick_device(device)
+    return Benchmark(read, tuple(variants), Path(runs), place, default_workers(workers), tf32, stack)
+
+
+def _configs(entry: Entry) -> list[Any]:
+    kind = load_algorithm(entry.algorithm)
+    found = configurations(kind.Config, entry.settings, entry.algorithm)
+    return list(dict.fromkeys(kind.Config(**values) for values in found))
+
+
+def _seconds(text: str) -> float:
+    """Return the seconds of `9m`, `1.5h` or `90s`."""
+    try:
+        value = float(text[:-1]) * UNITS[text[-1]]
+    except (ValueError, KeyError, IndexError):
+        raise OffbenchError(f"a budget is a time like 9m, 1.5h or 90s, not {text!r}") from None
+    if not 0 < value < float("inf"):
+        raise OffbenchError(f"a budget must be more than nothing, not {text!r}")
+    return value
+
+
+def _parts(bench: Benchmark, shard: tuple[int, int]) -> list[tuple[Part, Schedule]]:
+    """Return this shard's parts. Runs of equal times are cut together, whatever their algorithm."""
+    place, count = shard
+    if not 0 <= place < count:
+        raise OffbenchError(f"a shard is i/n with i from 0 to n - 1, not {place}/{count}")
+    by_times: dict[Times, list[Variant]] = {}
+    for one in bench.variants:
+        by_times.setdefault(replace(one.times, seeds=()), []).append(one)
+    found = []
+    for times, variants in by_times.items():
+        orders = [order for one in variants for order in bench.orders(one)]
+        schedule = Schedule(times.steps, times.eval_every, times.eval_episodes, bench.device, workers=0)
+        found += [(part, schedule) for part in cut(orders, bench.device, bench.processes * count, bench.stack)]
+    return found[place::count]
+
+
+def plan(bench: Benchmark) -> Iterator[str]:
+    """Yield what the grid is and what is left of it costs here, a line each; a finished grid costs no calibration."""
+    specs = {source.env: _recipe(source).env_spec() for source in bench.grid.datasets if source.env}
+    specs = specs or {"": _known_spec(bench.grid.datasets[0])}
+    spec = next(iter(specs.values()))  # for the shapes, which differ little
+    runs = {one: bench.orders(one) for one in bench.variants}
+    left = {one: [order for order in orders if not _done(order, one.times)] for one, orders in runs.items()}
+    total, datasets = sum(map(len, runs.values())), len(bench.grid.datasets)
+    yield f"{bench.grid.name}: {datasets} datasets, {len(runs)} variants, {total} runs, {_count(left)} to train"
+    if not any(left.values()):
+        return
+    play = float(np.mean([step_seconds(spec) for spec in specs.values()]))
+    seconds, disk = 0.0, 0.0
+    for one, orders in left.items():
+        if not orders:
+            continue
+        rate = measure(one.algorithm, one.config, spec, bench.device, tf32=bench.tf32)
+        cost = len(orders) * _cost(one.times, rate, play, spec) / bench.processes
+        yield (
+            f"  {one.name:<40}{len(orders):>4} runs x {one.times.steps:>9,} updates, "
+            f"{rate.updates:>8,.0f} a second: {duration(cost)}"
+        )
+        seconds += cost
+        disk += 2 * rate.bytes_per_run * len(orders)
+    if missing := bench.missing():
+        steps = sum(_size(source) for source in missing)
+        seconds += steps * play / bench.workers
+        disk += steps * _bytes_per_step(spec)
+        yield f"  to record first: {', '.join(source.id for source in missing)} ({steps:,} transitions)"
+    where = f"{bench.processes} processes of one thread" if bench.device == "cpu" else bench.device
+    yield f"  on {where} about {duration(seconds)}, {disk / 1e9:.1f} GB of disk (measured for a moment, just now)"
+    if bench.device == "cpu":
+        yield "  on a GPU: not known here; the same command on a machine with one tells"
+
+
+def _done(order: Order, times: Times) -> bool:
+    return times.steps in checkpoints.steps(Path(order.folder))
+
+
+def _count(left: Mapping[Variant, Sequence[Order]]) -> int:
+    return sum(map(len, left.values()))
+
+
+def _cost(times: Times, rate: Rate, play: float, spec: str) -> float:
+    """Return the seconds of one run: its updates and its evaluations, full-length episodes assumed."""
+    length = json.loads(spec).get("max_episode_steps") or 1000
+    episodes = -(-times.steps // times.eval_every) * times.eval_episodes
+    return times.steps / rate.updates + episodes * length * play
+
+
+def _recipe(source: Source) -> Recipe:
+    return load_recipe(source.env)
+
+
+def _known_spec(source: Source) -> str:
+    metadata = dataset.read_metadata(source.id)
+    spec = metadata.get("eval_env_spec") or metadata.get("env_spec")
+    if not isinstance(spec, str):
+        raise OffbenchError(f"{source.id} names no environment to plan by; give its env in the grid")
+    return spec
+
+
+def _size(source: Source) -> int:
+    """Return the transitions of a dataset that is to be recorded, about."""
+    if source.steps or not source.env:
+        return source.steps or 0
+    _, parts = parse_level(source.level)
+    return round(_recipe(source).dataset_steps * sum(part.weight for part in parts))
+
+
+def _bytes_per_step(spec: str) -> int:
+    """Return what a transition takes on disk: in the dataset (float64 observations) and in the cache (float32)."""
+    from offbench.environments import make_env
+
+    env = make_env(spec)
+    observations, actions = env.observation_space.shape, env.action_space.shape
+    env.close()
+    assert observations is not None
+    assert actions is not None
+    return 12 * observations[0] + 8 * actions[0] + 34

@@ -1,0 +1,177 @@
+"""`compare`: two groups of runs, paired over datasets and seeds, with a plain verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from offbench.errors import OffbenchError, unknown
+from offbench.results import REFERENCES, Entry, Results, read_results
+from offbench.statistics import Estimate, Paired, improvement, paired
+
+LEVEL = 0.05  # a difference is evidence below this p, if its interval leaves out 0 too
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The scores of A's and B's run of one dataset and seed."""
+
+    dataset: str
+    seed: int
+    a: float
+    b: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A against B over the datasets and seeds that both have.
+
+    Attributes:
+        a, b: the groups as selected.
+        pairs: what everything else is computed from.
+        reference: what the scores are normalised by, in words.
+        statistics: difference of A - B.
+        chance: probability that a run of A scores above one of B, over the paired runs.
+        unpaired: how many runs of either have no partner and are left out.
+        steps: how far A's and B's paired runs have been evaluated.
+        unfinished: how many of the paired runs have not reached their last step, or have diverged.
+    """
+
+    a: str
+    b: str
+    pairs: list[Pair]
+    reference: str
+    statistics: Paired
+    chance: Estimate
+    unpaired: int
+    steps: tuple[list[int], ...]
+    unfinished: int
+
+    @property
+    def verdict(self) -> str:
+        """Who is better, or that there is no evidence of a difference."""
+        estimate, sizes = self.statistics.difference, Counter(pair.dataset for pair in self.pairs)
+        counts = sorted(set(sizes.values()))
+        over = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+        over += " seed" if counts[-1] == 1 else " seeds"
+        over += f" on {len(sizes)} datasets" if len(sizes) > 1 else ""
+        low, high = estimate.low, estimate.high
+        if low is None or high is None or low <= 0 <= high or self.statistics.p > LEVEL:
+            return f"no evidence of a difference at {over}"
+        better, value = (self.a, estimate) if low > 0 else (self.b, Estimate(-estimate.value, -high, -low))
+        return f"{better} is better: +{value} at {over}"
+
+    def lines(self) -> list[str]:
+        """Return the comparison as text."""
+        found = self.statistics
+        effect = "-" if found.standardised is None else f"{found.standardised:+.2f}"
+        percent = self.chance.percent()
+        lines = [f"{self.a} against {self.b} ({self.reference})", ""]
+        width = max(len(pair.dataset) for pair in self.pairs)
+        for p in self.pairs:
+            lines.append(f"{p.dataset:<{width}}  seed {p.seed:<3} {p.a:>8.1f} {p.b:>8.1f}  {p.a - p.b:>+8.1f}")
+        lines += [
+            "",
+            f"mean difference             {found.difference.value:+.1f} {found.difference.span()}".rstrip(),
+            f"standardised                {effect} (over the deviation of the {found.pairs} paired differences)",
+            f"probability of improvement  {percent.value:.0f}% {percent.span()}".rstrip(),
+            f"sign-flip test              p = {found.p:.3g}",
+        ]
+        if self.steps[0] != self.steps[1]:
+            told = [" to ".join(f"{step:,}" for step in dict.fromkeys((s[0], s[-1]))) for s in self.steps]
+            lines.append(f"note: not the same training: {self.a} {told[0]} steps, {self.b} {told[1]}")
+        if self.unfinished:
+            lines.append(f"note: {self.unfinished} of the paired runs did not reach their last step")
+        if self.unpaired:
+            lines.append(f"note: {self.unpaired} runs have no partner of the same dataset and seed and are left out")
+        return [*lines, "", self.verdict]
+
+    def row(self) -> dict[str, Any]:
+        """Return the comparison as JSON has it."""
+        found, chance = self.statistics, self.chance
+        return {
+            "a": self.a,
+            "b": self.b,
+            "reference": self.reference,
+            "difference": found.difference.value,
+            "low": found.difference.low,
+            "high": found.difference.high,
+            "standardised": found.standardised,
+            "p": found.p,
+            "probability_of_improvement": chance.value,
+            "probability_low": chance.low,
+            "probability_high": chance.high,
+            "pairs": [dataclasses.asdict(pair) for pair in self.pairs],
+            "unpaired": self.unpaired,
+            "unfinished": self.unfinished,
+            "verdict": self.verdict,
+        }
+
+
+def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
+    """Compare two groups of runs over the datasets and seeds that both have.
+
+    Args:
+        a, b: ALGO or ALGO/VARIANT, e.g. `td3_bc` and `bdb/beta=0.5`; an algorithm alone is its default variant,
+            or its only one.
+        runs: the folder of the run directories.
+
+    Raises:
+        OffbenchError: no such group, the two are one, or they share no dataset and seed.
+    """
+    results = read_results(runs)
+    groups = select(results, a), select(results, b)
+    if groups[0] == groups[1]:
+        raise OffbenchError(f"{a} and {b} are the same runs; give two groups")
+    left, right = ({(entry.task, t.seed): t for entry in group for t in entry.runs} for group in groups)
+    both = [key for key in left if key in right]
+    if not both:
+        raise OffbenchError(f"{a} and {b} share no dataset with a seed in common: there is nothing to pair")
+    tasks = {task for task, _ in both}
+    if len(tasks) > 1 and any(task.reference is None for task in tasks):
+        raise OffbenchError(
+            "a dataset without reference scores has raw returns, which do not average with other datasets' scores; "
+            "give a --runs folder of one dataset"
+        )
+    scores = [(left[key].score(key[0].reference), right[key].score(key[0].reference)) for key in both]
+    pairs = [Pair(task.name, seed, *found) for (task, seed), found in zip(both, scores, strict=True)]
+    trained = [[found[key] for key in both] for found in (left, right)]
+    return Comparison(
+        groups[0][0].method.label,
+        groups[1][0].method.label,
+        pairs,
+        " and ".join(sorted({REFERENCES[task.reference] for task in tasks})),
+        paired(_by_dataset(pairs, lambda pair: pair.a - pair.b)),
+        improvement(_by_dataset(pairs, lambda pair: pair.a), _by_dataset(pairs, lambda pair: pair.b)),
+        len(left) + len(right) - 2 * len(both),
+        tuple(sorted({t.reached for t in side}) for side in trained),
+        sum(t.state != "finished" for side in trained for t in side),
+    )
+
+
+def _by_dataset(pairs: Iterable[Pair], value: Callable[[Pair], float]) -> dict[str, list[float]]:
+    found: dict[str, list[float]] = {}
+    for pair in pairs:
+        found.setdefault(pair.dataset, []).append(value(pair))
+    return found
+
+
+def select(results: Results, selector: str) -> list[Entry]:
+    """Return the entries that ALGO or ALGO/VARIANT names. Raises OffbenchError unless they are of one variant."""
+    algorithm, slash, variant = selector.partition("/")
+    known = [method for method in results.methods if method.algorithm == algorithm]
+    if not known:
+        raise unknown("algorithm", algorithm, {method.algorithm for method in results.methods})
+    variants = {method.variant: method for method in known}
+    if not slash:
+        variant = next(iter(variants)) if len(variants) == 1 else "default"
+        if variant not in variants:
+            names = ", ".join(f"{algorithm}/{name}" for name in variants)
+            raise OffbenchError(f"{algorithm} has several variants: give one of {names}")
+    if variant not in variants:
+        raise unknown(f"variant of {algorithm}", variant, variants)
+    return results.of(variants[variant])

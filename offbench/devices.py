@@ -1,0 +1,78 @@
+"""The device that a stack trains on: which, with what precision, and how many runs it holds."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from offbench.algorithm import Algorithm
+from offbench.batches import Member
+from offbench.errors import OffbenchError
+from offbench.stack import WARM_UP, Stack
+
+CPU_STACK = 8  # runs of one process: more gain nothing there, and each waits for all
+MEMORY_SHARE = 0.8  # of a GPU's free memory that a stack may take
+
+
+def pick_device(device: str) -> str:
+    """Return the device to train on: `auto` takes a GPU if there is one.
+
+    Raises:
+        OffbenchError: not a device, or one that this machine lacks.
+    """
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    kind, _, index = device.partition(":")
+    if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
+        raise OffbenchError(f"device must be auto, cpu, cuda or cuda:N, not {device!r}")
+    if kind == "cuda" and (not torch.cuda.is_available() or int(index or 0) >= torch.cuda.device_count()):
+        found = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        raise OffbenchError(
+            f"no device {device}: PyTorch {torch.__version__} sees {found} GPUs here; use --device cpu"
+        )
+    return device
+
+
+@contextmanager
+def arithmetic(device: str, tf32: bool) -> Iterator[None]:
+    """Set threads and precision of matrix products for a training, and put them back after it.
+
+    On the CPU one thread: two runs in two processes beat one run on two threads. On a GPU float32, or TF32 (10 bits
+    of mantissa, several times faster) where the user asks for it.
+    """
+    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    if device == "cpu":
+        torch.set_num_threads(1)
+    torch.set_float32_matmul_precision("high" if tf32 else "highest")
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        torch.set_float32_matmul_precision(precision)
+
+
+def stack_size(kind: type[Algorithm], member: Member, device: str) -> int:
+    """Return how many runs like `member` train best as one stack on this device.
+
+    On a GPU what its free memory holds, measured: the peaks of a stack of one and of three runs over a few updates
+    tell what a run costs beside the dataset.
+    """
+    if device == "cpu":
+        return CPU_STACK
+    peaks = []
+    for runs in (1, 3):
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_reserved(device)
+        stack = Stack(kind, [member] * runs, device)
+        for _ in stack.train(4 * WARM_UP):
+            pass
+        peaks.append(torch.cuda.max_memory_reserved(device) - before)
+        del stack
+        gc.collect()
+        torch.cuda.empty_cache()
+    cost = max((peaks[1] - peaks[0]) / 2, 1.0)
+    free, _ = torch.cuda.mem_get_info(device)
+    return max(1, int((MEMORY_SHARE * free - peaks[0]) / cost) + 1)

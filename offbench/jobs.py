@@ -1,0 +1,216 @@
+"""Jobs: stacks as plain values, so that another process, or another machine, can train them.
+
+Order   one run: algorithm, dataset, settings, seed, where it is written, for how long
+Job     the orders that train together
+perform(job)             trains it in this process
+run_jobs(jobs, n)        trains them in n processes, and shows one progress bar for all
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import multiprocessing
+import os
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+from offbench import transitions
+from offbench.batches import Member
+from offbench.errors import OffbenchError
+from offbench.progress import Progress
+from offbench.registry import load_algorithm
+from offbench.rollout import quiet_start, start_worker
+from offbench.runs import Run
+from offbench.settings import build
+from offbench.training import Report, Schedule, Trainer
+from offbench.transitions import Transitions
+
+
+@dataclass(frozen=True)
+class Order:
+    """One run that is to be trained.
+
+    Attributes:
+        settings: the algorithm's, by name; what is left out has its default.
+        folder: the run's directory.
+    """
+
+    algorithm: str
+    dataset: str
+    settings: dict[str, Any]
+    seed: int
+    folder: str
+
+    @property
+    def host(self) -> str | None:
+        """The algorithm that this one is a special case of, and whose stack it may join."""
+        joins = getattr(load_algorithm(self.algorithm), "joins", None)
+        return joins[0] if joins else None
+
+    def config(self, kind: str | None = None) -> Any:
+        """Return the settings, as those of `kind` if that is the algorithm's host. Raises OffbenchError."""
+        own: Any = build(load_algorithm(self.algorithm).Config, self.settings, self.algorithm)
+        if kind in (None, self.algorithm):
+            return own
+        _, special = load_algorithm(self.algorithm).joins  # type: ignore[attr-defined]
+        return load_algorithm(str(kind)).Config(**vars(own), **special)
+
+    def member(self, data: Transitions | None = None, kind: str | None = None) -> Member:
+        """Return the run as a stack of `kind` takes it. Raises OffbenchError for a bad setting or dataset."""
+        data = data or transitions.load(self.dataset)
+        run, guest = Run(Path(self.folder)), kind not in (None, self.algorithm)
+        return Member(run, self.seed, self.config(kind), data, self.algorithm, guest)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A stack that is to be trained."""
+
+    kind: str
+    orders: tuple[Order, ...]
+    schedule: Schedule
+    tf32: bool = False
+
+    @property
+    def updates(self) -> int:
+        """Updates of all its runs together."""
+        return len(self.orders) * self.schedule.steps
+
+    @property
+    def title(self) -> str:
+        """What a progress bar calls it."""
+        first, runs = self.orders[0], len(self.orders)
+        return f"{self.kind} on {first.dataset}" + (f" ({runs} runs)" if runs > 1 else "")
+
+
+def perform(job: Job, report: Report) -> list[str]:
+    """Train a job in this process.
+
+    Returns:
+        A line for each run that diverged.
+
+    Raises:
+        OffbenchError: anything that the user can mend.
+    """
+    from offbench.devices import arithmetic
+
+    loaded = {name: transitions.load(name) for name in dict.fromkeys(order.dataset for order in job.orders)}
+    members = [order.member(loaded[order.dataset], job.kind) for order in job.orders]
+    with arithmetic(job.schedule.device, job.tf32):
+        return Trainer(load_algorithm(job.kind), members, job.schedule).train(report)
+
+
+def run_jobs(jobs: Sequence[Job], processes: int) -> list[str]:
+    """Train jobs, so many at a time; a job that fails does not stop the others.
+
+    Returns:
+        What went wrong, a line each.
+    """
+    with Board(jobs) as board:
+        if processes == 1 or len(jobs) == 1:
+            return [line for i, job in enumerate(jobs) for line in _here(job, i, board)]
+        with _Pool() as pool:
+            return list(_spread(jobs, processes, pool, board))
+
+
+class Board(contextlib.AbstractContextManager["Board"]):
+    """Adds up the jobs' steps for one progress bar."""
+
+    def __init__(self, jobs: Sequence[Job]) -> None:
+        self.jobs, self.steps = jobs, dict[int, int]()
+        runs = sum(len(job.orders) for job in jobs)
+        self.progress = Progress(sum(job.updates for job in jobs), jobs[0].title if len(jobs) == 1 else f"{runs} runs")
+
+    def __exit__(self, *error: Any) -> None:
+        self.progress.__exit__(*error)
+
+    def at(self, job: int, step: int, note: str) -> None:
+        """Take in that a job is at `step`."""
+        if job not in self.steps:  # what was there before counts as done, not as speed
+            self.progress.skip(step * len(self.jobs[job].orders))
+        self.steps[job] = step
+        self.progress.to(sum(step * len(self.jobs[i].orders) for i, step in self.steps.items()), note)
+
+
+def _here(job: Job, place: int, board: Board) -> list[str]:
+    if is_over(job):
+        return []
+    try:
+        return perform(job, lambda step, note: board.at(place, step, note))
+    except OffbenchError as error:
+        if len(board.jobs) == 1:
+            raise
+        return [str(error)]
+
+
+def is_over(job: Job) -> bool:
+    """Whether a job's deadline has passed."""
+    return job.schedule.deadline is not None and time.time() > job.schedule.deadline
+
+
+class _Pool(contextlib.AbstractContextManager["_Pool"]):
+    """The processes at work; leaving the context ends them."""
+
+    def __init__(self) -> None:
+        self.active: dict[Connection, tuple[int, multiprocessing.process.BaseProcess]] = {}
+
+    def start(self, place: int, job: Job) -> None:
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe(duplex=False)
+        process = context.Process(target=_work, args=(job, theirs, os.getpid()), daemon=False)
+        with quiet_start():
+            process.start()
+        theirs.close()
+        self.active[ours] = (place, process)
+
+    def end(self, pipe: Connection) -> None:
+        _, process = self.active.pop(pipe)
+        pipe.close()
+        process.join()
+
+    def __exit__(self, *_error: object) -> None:
+        for _, process in self.active.values():
+            process.terminate()
+        for pipe in list(self.active):
+            self.end(pipe)
+
+
+def _spread(jobs: Sequence[Job], processes: int, pool: _Pool, board: Board) -> Iterator[str]:
+    waiting = collections.deque(enumerate(jobs))
+    while waiting or pool.active:
+        while waiting and len(pool.active) < processes:
+            place, job = waiting.popleft()
+            if not is_over(job):
+                pool.start(place, job)
+        for ready in wait(list(pool.active)):
+            assert isinstance(ready, Connection)
+            at_work = pool.active[ready][0]
+            try:
+                step, note, lines = ready.recv()
+            except EOFError:
+                step, note = None, ""
+                lines = [f"a training process died (killed, or out of memory): {jobs[at_work].title}"]
+            if step is not None:
+                board.at(at_work, step, note)
+                continue
+            yield from lines
+            pool.end(ready)
+
+
+def _work(job: Job, pipe: Connection, parent: int) -> None:
+    """The life of a training process: (step, note, None) as it goes, then (None, "", problems)."""
+    start_worker(parent)
+    try:
+        lines = perform(job, lambda step, note: pipe.send((step, note, None)))
+    except OffbenchError as error:
+        lines = [str(error)]
+    except Exception:
+        # a fault of ours or of a third party's algorithm: the parent shows it whole
+        lines = [f"{job.title}: {traceback.format_exc()}"]
+    pipe.send((None, "", lines))

@@ -1,0 +1,43 @@
+"""HTML as nested calls: text is escaped unless it is markup already, so no name can become a tag."""
+
+from __future__ import annotations
+
+import html
+
+
+class Markup(str):
+    """Text that is HTML and stays as it is."""
+
+    __slots__ = ()
+
+
+SHORT = 28
+VOID = ("meta", "img", "br", "wbr")
+
+
+def tag(name: str, /, *children: str | Markup, **attributes: str | int | bool | None) -> Markup:
+    """Return an element. A trailing _ of an attribute is dropped (class_), other _ become -; None leaves it out."""
+    parts = [name]
+    for key, value in attributes.items():
+        key = key.rstrip("_").replace("_", "-")
+        if value is True:
+            parts.append(key)
+        elif value is not None and value is not False:
+            parts.append(f'{key}="{html.escape(str(value), quote=True)}"')
+    opening = f"<{' '.join(parts)}>"
+    return Markup(opening) if name in VOID else Markup(f"{opening}{join(*children)}</{name}>")
+
+
+def join(*children: str | Markup) -> Markup:
+    """Return markup and text (escaped) one after another."""
+    return Markup("".join(c if isinstance(c, Markup) else html.escape(c, quote=False) for c in children))
+
+
+def breakable(text: str) -> Markup:
+    """Return short text as one piece; long text (variants, paths) may break after commas, slashes, equals signs."""
+    if len(text) <= SHORT:
+        return tag("span", text, class_="short")
+    escaped = html.escape(text, quote=False)
+    for character in ",=/":
+        escaped = escaped.replace(character, f"{character}<wbr>")
+    return Markup(escaped)

@@ -1,0 +1,279 @@
+"""The report's figures: learning curves, final scores, IQM, performance profiles, beta and |Q| over training.
+
+A figure is drawn once and kept three ways: PNG and SVG files with a legend, and an SVG for the page without one
+(the page has its own), whose ink is the page's text colour so that it reads on light and dark.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from offbench.results import REFERENCES, Entry, Method, Results, Task
+from offbench.statistics import Estimate, Scores, curve, iqm, profile
+
+INK = "#21252b"  # text and axes; the page replaces it by its own text colour
+GRID = "#8b93a0"
+# read on white and on near-black, and by the colour-blind (after Okabe and Ito)
+COLORS = ("#2f7fc1", "#d0700f", "#1c9a72", "#c2588f", "#8a6fd1", "#b58a00", "#d1495b", "#6b7785")
+STYLES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)))
+SIZE = (4.4, 2.9)
+PROFILE_POINTS = 121
+
+
+@dataclass(frozen=True)
+class Line:
+    """How one method is drawn everywhere."""
+
+    label: str
+    color: str
+    style: Any
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure as its files and as part of the page.
+
+    Attributes:
+        name: the stem of its files.
+        caption: what it shows.
+        alt: the same for those who cannot see it, with its main numbers.
+        lines: what a legend must tell.
+    """
+
+    name: str
+    caption: str
+    alt: str
+    png: bytes
+    svg: bytes
+    inline: str
+    lines: tuple[Line, ...]
+
+
+def lines(methods: Sequence[Method]) -> dict[Method, Line]:
+    """Return colour and dashes of each method; sixteen methods and more repeat colours with other dashes."""
+    return {
+        method: Line(method.label, COLORS[i % len(COLORS)], STYLES[(i + i // len(COLORS)) % len(STYLES)])
+        for i, method in enumerate(methods)
+    }
+
+
+def curve_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str) -> Figure:
+    """Draw one task's learning curves: mean over seeds with its 95% interval (the paper's Figure 4)."""
+    task = entries[0].task
+    ends = []
+
+    def paint(axes: Any) -> None:
+        for entry in entries:
+            steps, values = entry.common_curve()
+            if steps:
+                points = curve(values)
+                _band(axes, steps, points, looks[entry.method])
+                ends.append(f"{entry.method.label} {points[-1].value:.1f}")
+        axes.set(xlabel="updates", ylabel=_unit(task), title=shortened(task.name, 44))
+
+    def alt() -> str:
+        return f"Learning curves on {task.name}. At the last common evaluation: {', '.join(dict.fromkeys(ends))}."
+
+    return _draw(name, "Mean over seeds, 95% bootstrap interval shaded.", alt, paint, _legend(entries, looks))
+
+
+def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str) -> Figure:
+    """Draw one task's final scores: a dot a seed, a bar for their mean."""
+    task = entries[0].task
+
+    def paint(axes: Any) -> None:
+        for row, entry in enumerate(entries):
+            color = looks[entry.method].color
+            axes.plot(entry.scores, [row] * len(entry.scores), "o", color=color, alpha=0.75, markersize=5, mew=0)
+            axes.plot([np.mean(entry.scores)] * 2, [row - 0.32, row + 0.32], color=color, linewidth=2)
+        _named_rows(axes, [looks[entry.method].label for entry in entries])
+        axes.set(xlabel=_unit(task), title=shortened(task.name, 44))
+
+    means = ", ".join(f"{entry.method.label} {np.mean(entry.scores):.1f}" for entry in entries)
+    return _draw(name, "A dot a seed, a bar for the mean.", f"Final scores on {task.name}. Means: {means}.", paint)
+
+
+def iqm_figure(found: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[Method, Line]) -> Figure:
+    """Draw every method's IQM with its interval."""
+
+    def paint(axes: Any) -> None:
+        for row, (method, (estimate, _)) in enumerate(found.items()):
+            color = looks[method].color
+            if estimate.low is not None:
+                axes.plot([estimate.low, estimate.high], [row, row], color=color, linewidth=7, alpha=0.35)
+            axes.plot([estimate.value] * 2, [row - 0.3, row + 0.3], color=color, linewidth=2.5)
+        _named_rows(axes, [looks[method].label for method in found])
+        axes.set(xlabel="IQM of normalised scores")
+
+    text = ", ".join(f"{method.label} {estimate}" for method, (estimate, _) in found.items())
+    caption = "Interquartile mean over all tasks and its 95% stratified bootstrap interval."
+    return _draw("iqm", caption, f"Interquartile means with 95% intervals: {text}.", paint)
+
+
+def profile_figure(found: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[Method, Line]) -> Figure:
+    """Draw the performance profiles: the fraction of runs above each score."""
+    every = [value for _, scores in found.values() for values in scores.values() for value in values]
+    taus = np.linspace(min(0.0, min(every)), max(100.0, max(every)), PROFILE_POINTS)
+
+    def paint(axes: Any) -> None:
+        for method, (_, scores) in found.items():
+            _band(axes, taus.tolist(), profile(scores, taus.tolist()), looks[method])
+        axes.set(xlabel="normalised score τ", ylabel="fraction of runs above τ", ylim=(-0.02, 1.02))
+
+    halves = {m.label: profile(s, [50.0])[0].value for m, (_, s) in found.items()}
+    text = ", ".join(f"{label} {100 * half:.0f}%" for label, half in halves.items())
+    caption = "Fraction of all runs that score above τ, 95% stratified bootstrap interval shaded. Higher is better."
+    return _draw("profiles", caption, f"Performance profiles. Runs above 50: {text}.", paint, list(looks.values()))
+
+
+def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure:
+    """Draw the IQM over all tasks against the updates, of the methods that have all tasks, where their runs meet."""
+    tasks = {task for task in results.tasks if task.reference}
+    whole = [method for method in results.methods if tasks <= {entry.task for entry in results.of(method)}]
+
+    def paint(axes: Any) -> None:
+        for method in whole:
+            curves = {e.task.name: e.common_curve() for e in results.of(method) if e.task.reference}
+            steps = sorted(set.intersection(*(set(found[0]) for found in curves.values())))
+            shown = steps[:: max(1, len(steps) // 40)]
+            points = [iqm({t: v[:, s.index(step)].tolist() for t, (s, v) in curves.items()}, 2000) for step in shown]
+            if shown:
+                _band(axes, shown, points, looks[method])
+        axes.set(xlabel="updates", ylabel="IQM of normalised scores", title="all tasks")
+
+    caption = "Interquartile mean over all tasks, 95% interval shaded; methods that have all tasks."
+    alt = f"Learning curves of the interquartile mean over all tasks: {', '.join(m.label for m in whole)}."
+    return _draw("curves-iqm", caption, alt, paint, [looks[method] for method in whole])
+
+
+def loss_figure(
+    entries: Sequence[Entry], looks: Mapping[Method, Line], name: str, column: str, label: str
+) -> Figure | None:
+    """Draw a column of losses.csv over training: mean over seeds, their range shaded; None if no run has it."""
+    task, ends, shown = entries[0].task, [], []
+    found = {entry.method: series for entry in entries if (series := _column(entry, column))}
+    if not found:
+        return None
+    for method, (steps, values) in found.items():
+        ends.append(f"{method.label} {values.mean(0)[-1]:.3g} at {steps[-1]:,}")
+        shown.append(looks[method])
+
+    def paint(axes: Any) -> None:
+        for method, (steps, values) in found.items():
+            mean, low, high = values.mean(0), values.min(0), values.max(0)
+            points = [Estimate(*map(float, row)) for row in zip(mean, low, high, strict=True)]
+            _band(axes, steps, points, looks[method])
+        if column == "beta":
+            axes.set_ylim(-0.03, 1.03)
+        axes.set(xlabel="updates", ylabel=label, title=shortened(task.name, 44))
+
+    alt = f"{label} over training on {task.name}. At the end: {', '.join(ends)}."
+    return _draw(name, "Mean over seeds, their range shaded.", alt, paint, shown)
+
+
+def _column(entry: Entry, column: str) -> tuple[list[int], np.ndarray[Any, Any]] | None:
+    """Return (steps, values [runs, steps]) of the rows that all runs have; long series are thinned."""
+    series = [
+        {int(row["step"]): row[column] for row in t.run.losses() if {"step", column} <= row.keys()} for t in entry.runs
+    ]
+    steps = sorted(set.intersection(*(set(found) for found in series)))
+    steps = steps[:: max(1, len(steps) // 200)]
+    if not steps:
+        return None
+    return steps, np.array([[found[step] for step in steps] for found in series])
+
+
+def _band(axes: Any, x: Sequence[float], points: Sequence[Estimate], look: Line) -> None:
+    values = [point.value for point in points]
+    marker = "o" if len(x) == 1 else ""
+    axes.plot(x, values, color=look.color, linestyle=look.style, linewidth=1.6, marker=marker, markersize=4)
+    if all(point.low is not None for point in points):
+        low, high = [point.low for point in points], [point.high for point in points]
+        axes.fill_between(x, low, high, color=look.color, alpha=0.16, linewidth=0)
+
+
+def _named_rows(axes: Any, names: Sequence[str]) -> None:
+    axes.set_yticks(range(len(names)), [_two_lines(name) for name in names])
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
+
+
+def _two_lines(name: str) -> str:
+    """Return a long name on two lines, the first setting on the first."""
+    if len(name) <= 24:
+        return name
+    head, comma, tail = name.partition(",")
+    return f"{shortened(head + comma, 24)}\n{shortened(tail, 24)}".rstrip()
+
+
+def shortened(text: str, most: int) -> str:
+    """Return text without its middle where it is too long for a picture: variants differ at their ends."""
+    return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most - most // 2 - 1) :]}"
+
+
+def _unit(task: Task) -> str:
+    return "return" if task.reference is None else f"normalised score ({REFERENCES[task.reference]})"
+
+
+def _legend(entries: Sequence[Entry], looks: Mapping[Method, Line]) -> list[Line]:
+    return [looks[entry.method] for entry in entries]
+
+
+def _draw(
+    name: str,
+    caption: str,
+    alt: str | Callable[[], str],
+    paint: Callable[[Any], None],
+    legend: Sequence[Line] = (),
+) -> Figure:
+    """Draw a figure and keep it three ways. `alt` may be a function, called after the painting."""
+    import matplotlib as mpl
+    from matplotlib.lines import Line2D
+
+    from offbench.plots import figure
+
+    # names may hold $ and are not formulas; ids in the SVG must be the same on every run
+    style: Any = {"text.parse_math": False, "svg.fonttype": "none", "svg.hashsalt": name, "axes.labelcolor": INK}
+    style |= {"text.color": INK, "axes.edgecolor": GRID, "xtick.color": INK, "ytick.color": INK, "font.size": 9}
+    style |= {"axes.titlesize": 10, "axes.grid": True, "grid.color": GRID, "grid.alpha": 0.25, "grid.linewidth": 0.6}
+    with mpl.rc_context(style), figure() as (fig, (axes,)):
+        fig.set_size_inches(*SIZE)
+        fig.patch.set_alpha(0)
+        axes.patch.set_alpha(0)
+        paint(axes)
+        axes.ticklabel_format(axis="x", style="plain", useOffset=False)
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}" if abs(value) >= 10 else f"{value:g}")
+        axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+        inline = _saved(fig, "svg").decode()
+        fig.patch.set_alpha(1)
+        if legend:
+            handles = [Line2D([], [], color=look.color, linestyle=look.style) for look in legend]
+            names = [f" {shortened(look.label, 32)}" for look in legend]  # matplotlib hides labels that begin with _
+            fig.set_size_inches(SIZE[0], SIZE[1] + 0.2 * ((len(legend) + 1) // 2))
+            fig.legend(handles, names, loc="outside lower center", ncols=2, frameon=False, fontsize="small")
+        png, svg = _saved(fig, "png"), _saved(fig, "svg")
+    return Figure(name, caption, alt() if callable(alt) else alt, png, svg, _for_page(inline, name), tuple(legend))
+
+
+def _saved(fig: Any, kind: str) -> bytes:
+    data = io.BytesIO()
+    # no date and no version: the same runs give the same bytes
+    nothing = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None, "Format": None, "Type": None}}
+    fig.savefig(data, format=kind, dpi=160, metadata=nothing[kind])
+    return data.getvalue()
+
+
+def _for_page(svg: str, name: str) -> str:
+    """Return an SVG to stand in the page: ids of its own, the page's text colour and font, no fixed size."""
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>|<style .*?</style>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", svg)
+    svg = re.sub(r' width="[^"]*pt" height="[^"]*pt"| height="[^"]*pt"| width="[^"]*pt"', "", svg, count=2)
+    svg = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px system-ui, sans-serif", svg)
+    return svg.replace(INK, "currentColor").replace("<svg ", '<svg role="img" aria-hidden="true" ', 1)

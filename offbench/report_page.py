@@ -1,0 +1,208 @@
+"""The report's page: one HTML file with everything in it, to be opened without a network."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import importlib.resources
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from offbench.layout import Cell, Table
+from offbench.markup import Markup, breakable, join, tag
+from offbench.report_figures import Figure, Line
+from offbench.report_tables import cell_id
+from offbench.results import REFERENCES, Entry, Results, Trained
+from offbench.runs import Run
+from offbench.scores import run_return
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page: its heading, content, and words between them for who reads it on a screen."""
+
+    name: str
+    title: str
+    content: Sequence[Markup]
+    words: str = ""
+
+
+def page(title: str, lead: Markup, sections: Sequence[Section], boxes: Sequence[Markup]) -> bytes:
+    """Return the whole page. Nothing but its own script may run, and nothing may be fetched."""
+    style, script = (_asset(name) for name in ("report.css", "report.js"))
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = f"default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{digest}'"
+    head = tag(
+        "head",
+        tag("meta", charset="utf-8"),
+        tag("meta", http_equiv="Content-Security-Policy", content=policy),
+        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        tag("meta", name="generator", content="offbench"),
+        tag("meta", name="color-scheme", content="light dark"),
+        tag("title", title),
+        tag("style", Markup(style)),
+    )
+    links = [tag("a", section.title, href=f"#{section.name}") for section in sections]
+    body = [
+        tag("header", tag("h1", title), lead, tag("nav", *links, aria_label="Contents")),
+        tag("main", *[_section(section) for section in sections]),
+        *boxes,
+        tag("script", Markup(script)),
+    ]
+    return ("<!DOCTYPE html>\n" + tag("html", head, "\n", tag("body", *body), lang="en") + "\n").encode()
+
+
+def _asset(name: str) -> str:
+    return (importlib.resources.files("offbench") / "assets" / name).read_text(encoding="utf-8")
+
+
+def _section(section: Section) -> Markup:
+    words = [tag("p", section.words, class_="screen")] if section.words else []
+    return tag("section", tag("h2", section.title), *words, *section.content, "\n", id=section.name)
+
+
+def table(found: Table, *, caption: bool = False, download: bool = True) -> Markup:
+    """Return a table that sorts by a click on a column's header, with its title shown and links to its files."""
+    small = found.small or [""] * len(found.header)
+    head = []
+    for i, (text, below) in enumerate(zip(found.header, small, strict=True)):
+        more = [tag("small", breakable(below))] if below else []
+        head.append(
+            tag("th", tag("button", breakable(text), type="button"), *more, scope="col", class_=_kind(found, i))
+        )
+    rows = [tag("tr", *[_cell(found, i, cell) for i, cell in enumerate(row)]) for row in found.rows]
+    title = tag("caption", found.title, class_=None if caption else "unseen")
+    files = [
+        tag("a", ending.upper(), href=f"tables/{found.name}.{ending}", download=True)
+        for ending in ("csv", "md", "tex")
+    ]
+    return join(
+        tag(
+            "div",
+            tag("table", title, tag("thead", tag("tr", *head)), tag("tbody", *rows)),
+            class_="wide",
+            tabindex=0,
+            role="region",
+            aria_label=found.title,
+        ),
+        *[tag("p", note, class_="note") for note in found.notes],
+        *([tag("p", "This table: ", *files, class_="files")] if download else []),
+    )
+
+
+def _kind(found: Table, column: int) -> str:
+    return "name" if column < found.heads else "number"
+
+
+def _cell(found: Table, column: int, cell: Cell) -> Markup:
+    text: Markup = breakable(cell.text)
+    if cell.best:
+        text = tag("b", text)
+    if cell.detail:
+        text = tag("button", text, type="button", data_box=cell.detail, aria_haspopup="dialog")
+    for small in filter(None, (cell.more, cell.below)):
+        text = join(text, tag("small", breakable(small)))
+    value = None if cell.value is None else repr(float(cell.value))
+    if column < found.heads:
+        return tag("th", text, scope="row", class_="name", data_value=value)
+    return tag("td", text, class_="number best" if cell.best else "number", data_value=value)
+
+
+def figures(found: Sequence[Figure]) -> Markup:
+    """Return figures in a grid below one legend of all their lines."""
+    looks = dict.fromkeys(look for figure in found for look in figure.lines)
+    parts = []
+    for figure in found:
+        files = [
+            tag("a", ending.upper(), href=f"figures/{figure.name}.{ending}", download=True)
+            for ending in ("png", "svg")
+        ]
+        picture = tag("div", Markup(figure.inline), role="img", aria_label=figure.alt)
+        parts.append(tag("figure", picture, tag("figcaption", figure.caption, " ", *files)))
+    legend = [tag("ul", *[_key(look) for look in looks], class_="legend")] if looks else []
+    return join(*legend, tag("div", *parts, class_="figures"))
+
+
+def _key(look: Line) -> Markup:
+    dashes = "" if look.style == "-" else " ".join(f"{2 * part:g}" for part in look.style[1])
+    stroke = tag("line", x1=1, y1=5, x2=31, y2=5, stroke=look.color, stroke_width=3, stroke_dasharray=dashes or None)
+    return tag("li", tag("svg", stroke, viewBox="0 0 32 10", aria_hidden="true"), breakable(look.label))
+
+
+def boxes(results: Results) -> list[Markup]:
+    """Return a box for every cell of Table 1: where its number comes from."""
+    found = []
+    for i, task in enumerate(results.tasks):
+        for j, method in enumerate(results.methods):
+            entry = results.entries.get((task, method))
+            if entry is not None:
+                found.append(_box(results, entry, cell_id(i, j)))
+    return found
+
+
+def _box(results: Results, entry: Entry, name: str) -> Markup:
+    task, first = entry.task, entry.runs[0].config
+    commands = dict.fromkeys(str(trained.config.get("command") or "from Python") for trained in entry.runs)
+    references = [
+        f"{REFERENCES[key]}: {pair[0]:g} to {pair[1]:g}" for key, pair in first["references"].items() if pair
+    ]
+    settings = first["settings"] if isinstance(first["settings"], dict) else {}
+    facts = {
+        "dataset": f"{task.dataset}, content {task.content}",
+        "references": "; ".join(references) or "none",
+        "evaluation": f"every {first.get('eval_every', 0):,} updates, {first.get('eval_episodes', 0)} episodes",
+        "commands": "\n".join(commands),
+        "versions": _several([_words(trained.config.get("versions")) for trained in entry.runs]),
+        "hardware": _several([_hardware(trained) for trained in entry.runs]),
+        "settings": ", ".join(f"{key} {value}" for key, value in settings.items()) or "none",
+    }
+    title = f"{entry.method.label} on {task.name}"
+    terms = [part for key, text in facts.items() for part in (tag("dt", key), tag("dd", breakable(text)))]
+    close = tag("button", "Close", type="button", class_="close")
+    return tag(
+        "dialog",
+        tag("h3", breakable(title), id=f"{name}-title"),
+        _seeds(results, entry),
+        tag("dl", *terms),
+        close,
+        id=name,
+        aria_labelledby=f"{name}-title",
+    )
+
+
+def _seeds(results: Results, entry: Entry) -> Markup:
+    header = ["seed", "score", "return", "evaluations", "step", "folder"]
+    rows = []
+    for trained in entry.runs:
+        score = trained.score(entry.task.reference)
+        step = (
+            f"{trained.reached:,}" if trained.reached >= trained.steps else f"{trained.reached:,} of {trained.steps:,}"
+        )
+        cells = [
+            str(trained.seed),
+            f"{score:.2f}" if entry.task.reference else "-",
+            f"{run_return(trained.evaluations):.1f}",
+            str(len(trained.evaluations)),
+            step,
+        ]
+        folder = tag("td", breakable(relative(results, trained.run)), class_="name")
+        rows.append(tag("tr", *[tag("td", cell, class_="number") for cell in cells], folder))
+    head = tag("thead", tag("tr", *[tag("th", text, scope="col") for text in header]))
+    return tag("div", tag("table", head, tag("tbody", *rows), class_="plain"), class_="wide", tabindex=0)
+
+
+def relative(results: Results, run: Run) -> str:
+    """Return a run's folder as seen from the folder of all runs, so that a page does not name its machine."""
+    return run.folder.relative_to(results.root).as_posix()
+
+
+def _words(found: object) -> str:
+    return ", ".join(f"{key} {value}" for key, value in found.items()) if isinstance(found, Mapping) else "unknown"
+
+
+def _hardware(trained: Trained) -> str:
+    return f"{trained.config.get('device', 'unknown device')}; {_words(trained.config.get('hardware'))}"
+
+
+def _several(texts: Sequence[str]) -> str:
+    return "\n".join(dict.fromkeys(texts))

@@ -1,0 +1,272 @@
+"""Results: a folder of runs as tasks, methods and the scores of their seeds.
+
+    Task    a dataset: its id and its content; the reference that its scores are normalised by
+    Method  an algorithm and a variant
+    Entry   the evaluated runs of one method on one task: a cell of the score table
+
+Everything is read from the run directories alone.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offbench.errors import OffbenchError
+from offbench.levels import LEVELS
+from offbench.runs import Run, find_runs
+from offbench.scores import LAST, mean_std, normalize, run_return
+
+# the order of the BDB paper's Table 1
+LEVEL_ORDER = ("random", "medium-replay", "medium", "medium-expert", "expert")
+ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
+METHOD_ORDER = ("td3_bc", "cql", "bdb")
+REFERENCES = {"dataset": "own reference", "d4rl": "D4RL's constants", None: "no reference: raw return"}
+
+
+@dataclass(frozen=True)
+class Task:
+    """A dataset that runs were trained on.
+
+    Attributes:
+        content: its content hash; the same id may have been recorded twice.
+        reference: what scores are normalised by: "dataset", "d4rl" or None (raw returns).
+        twin: whether another content goes by the same id.
+    """
+
+    dataset: str
+    content: str
+    reference: str | None
+    twin: bool = False
+
+    @property
+    def name(self) -> str:
+        """The dataset's id, with its content's first digits where the id alone is ambiguous."""
+        return f"{self.dataset} ({self.content[:8]})" if self.twin else self.dataset
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """(environment, level) by the dataset's id; the level is empty where the id has none."""
+        stem = re.sub(r"-v\d+$", "", self.dataset)
+        found = re.fullmatch(rf"(.+?)[-/]({'|'.join(sorted(LEVELS, key=len, reverse=True))}|\d+percent)", stem)
+        return (found[1].split("/")[-1], found[2]) if found else (stem, "")
+
+
+@dataclass(frozen=True)
+class Method:
+    """An algorithm with its settings.
+
+    Attributes:
+        beta: the value of a setting of that name, as the published tables' columns have it.
+    """
+
+    algorithm: str
+    variant: str
+    beta: str | None = None
+
+    @property
+    def label(self) -> str:
+        """What a table's column says, e.g. `bdb beta=0.25`."""
+        variant = "" if self.variant == "default" else self.variant
+        if self.beta is not None and not re.search(r"(^|,)beta=", variant):
+            variant = f"beta={self.beta},{variant}".rstrip(",")
+        return f"{self.algorithm} {variant}".strip()
+
+    @property
+    def published(self) -> str:
+        """The method's name in published/scores.csv."""
+        return self.algorithm if self.beta is None else f"{self.algorithm} beta={self.beta}"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One run and what has been evaluated of it."""
+
+    run: Run
+    config: Mapping[str, Any]
+    evaluations: Mapping[int, Sequence[tuple[float, int]]]
+
+    @property
+    def seed(self) -> int:
+        """The run's seed."""
+        return int(self.config["seed"])
+
+    @property
+    def reached(self) -> int:
+        """The newest evaluated step."""
+        return max(self.evaluations)
+
+    @property
+    def steps(self) -> int:
+        """How far the run is to go."""
+        return int(self.config["steps"])
+
+    @property
+    def state(self) -> str:
+        """`finished`, `unfinished` or `diverged`."""
+        if self.run.diverged:
+            return "diverged"
+        return "finished" if self.reached >= self.steps else "unfinished"
+
+    def score(self, reference: str | None) -> float:
+        """Return the run's score by a reference that it has (None: its return)."""
+        return self._normalized(run_return(self.evaluations), reference)
+
+    def curve(self, reference: str | None) -> dict[int, float]:
+        """Return the score of each evaluation."""
+        means = {step: float(np.mean([ret for ret, _ in rows])) for step, rows in self.evaluations.items()}
+        return {step: self._normalized(mean, reference) for step, mean in means.items()}
+
+    def _normalized(self, value: float, reference: str | None) -> float:
+        return value if reference is None else normalize(value, *self.config["references"][reference])
+
+
+@dataclass(frozen=True)
+class Entry:
+    """The runs of one method on one task, in order of their seeds."""
+
+    task: Task
+    method: Method
+    runs: tuple[Trained, ...]
+
+    @property
+    def scores(self) -> list[float]:
+        """Each run's score by the task's reference."""
+        return [trained.score(self.task.reference) for trained in self.runs]
+
+    def mean_std(self, reference: str | None) -> tuple[float, float | None] | None:
+        """Return mean and deviation over seeds by a reference; None if a run lacks it."""
+        if reference is not None and not all(t.config["references"].get(reference) for t in self.runs):
+            return None
+        return mean_std([trained.score(reference) for trained in self.runs])
+
+    @property
+    def reached(self) -> int:
+        """The step that every run has been evaluated at or after."""
+        return min(trained.reached for trained in self.runs)
+
+    @property
+    def steps(self) -> int:
+        """How far the runs are to go."""
+        return max(trained.steps for trained in self.runs)
+
+    @property
+    def states(self) -> set[str]:
+        """How far the runs are: `finished`, `unfinished`, `diverged`."""
+        return {trained.state for trained in self.runs}
+
+    @property
+    def evaluations(self) -> int:
+        """The fewest evaluations behind a run's score."""
+        return min(min(len(trained.evaluations), LAST) for trained in self.runs)
+
+    def common_curve(self) -> tuple[list[int], np.ndarray[Any, Any]]:
+        """Return the steps that all runs were evaluated at, and their scores [runs, steps]."""
+        curves = [trained.curve(self.task.reference) for trained in self.runs]
+        steps = sorted(set.intersection(*(set(curve) for curve in curves)))
+        return steps, np.array([[curve[step] for step in steps] for curve in curves])
+
+
+@dataclass(frozen=True)
+class Results:
+    """All entries of a folder, tasks and methods in the order of the paper's table."""
+
+    root: Path
+    tasks: tuple[Task, ...]
+    methods: tuple[Method, ...]
+    entries: Mapping[tuple[Task, Method], Entry]
+    waiting: tuple[Run, ...]  # claimed, not yet evaluated
+
+    def of(self, method: Method) -> list[Entry]:
+        """Return a method's entries in order of tasks."""
+        return [self.entries[task, method] for task in self.tasks if (task, method) in self.entries]
+
+    def scores(self, method: Method) -> dict[str, list[float]]:
+        """Return {task: normalised scores of its seeds}; tasks without a reference are left out."""
+        return {entry.task.name: entry.scores for entry in self.of(method) if entry.task.reference}
+
+
+def read_results(root: str | Path) -> Results:
+    """Read every run below a folder.
+
+    Raises:
+        OffbenchError: none is evaluated, one is damaged, or one is there twice.
+    """
+    groups: dict[tuple[str, str, str, str], list[Trained]] = {}
+    waiting = []
+    for run in find_runs(Path(root)):
+        config, evaluations = run.config(), run.evaluations()
+        _check(run, config)
+        if not evaluations:
+            waiting.append(run)
+            continue
+        key = (config["dataset"], config["dataset_sha256"], config["algorithm"], config["variant"])
+        groups.setdefault(tuple(map(str, key)), []).append(Trained(run, config, evaluations))  # type: ignore[arg-type]
+    if not groups:
+        raise OffbenchError(f"no evaluated runs below {root}; start one with `offbench train ALGO --dataset ID`")
+    tasks = _tasks(groups)
+    entries = {}
+    for (dataset, content, algorithm, variant), runs in groups.items():
+        runs.sort(key=lambda trained: trained.seed)
+        _check_seeds(runs)
+        beta = runs[0].config["settings"].get("beta") if isinstance(runs[0].config["settings"], dict) else None
+        beta = f"{beta:.2f}" if isinstance(beta, int | float) else beta
+        task, method = tasks[dataset, content], Method(algorithm, variant, beta)
+        entries[task, method] = Entry(task, method, tuple(runs))
+    methods = sorted({method for _, method in entries}, key=_method_order)
+    return Results(Path(root), tuple(sorted(tasks.values(), key=_task_order)), tuple(methods), entries, tuple(waiting))
+
+
+def _check(run: Run, config: Mapping[str, Any]) -> None:
+    """Raise OffbenchError if a config holds something else than the training wrote."""
+    references, whole = config["references"], ("seed", "steps")
+    good = isinstance(references, dict) and all(type(config[key]) is int for key in whole)
+    for name in ("dataset", "d4rl"):
+        pair = references.get(name) if isinstance(references, dict) else None
+        if pair is not None:
+            numbers = isinstance(pair, list) and [type(end) in (int, float) for end in pair] == [True, True]
+            good = good and numbers and pair[0] < pair[1]
+    if not good:
+        raise OffbenchError(f"{run.config_path} is damaged: seed, steps or references; delete the run to repeat it")
+
+
+def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[Trained]]) -> dict[tuple[str, str], Task]:
+    """Return the task of each (dataset, content), with a reference that all its runs have."""
+    runs: dict[tuple[str, str], list[Trained]] = {}
+    for key, group in groups.items():
+        runs.setdefault(key[:2], []).extend(group)
+    ids = [dataset for dataset, _ in runs]
+    found = {}
+    for (dataset, content), group in runs.items():
+        known = [name for name in ("dataset", "d4rl") if all(t.config["references"].get(name) for t in group)]
+        found[dataset, content] = Task(dataset, content, known[0] if known else None, ids.count(dataset) > 1)
+    return found
+
+
+def _check_seeds(runs: Sequence[Trained]) -> None:
+    for one, other in itertools.pairwise(runs):
+        if one.seed == other.seed:
+            raise OffbenchError(
+                f"{one.run.folder} and {other.run.folder} are the same run twice: one seed counts once; "
+                "give a folder that holds each run once"
+            )
+
+
+def _rank(name: str, order: Sequence[str]) -> tuple[int, str]:
+    return (order.index(name) if name in order else len(order), name)
+
+
+def _task_order(task: Task) -> tuple[Any, ...]:
+    env, level = task.place
+    return _rank(level, LEVEL_ORDER), _rank(env, ENV_ORDER), task.dataset, task.content
+
+
+def _method_order(method: Method) -> tuple[Any, ...]:
+    # the fixed betas in order, then the words (adaptive)
+    return _rank(method.algorithm, METHOD_ORDER), method.beta or "", len(method.variant), method.variant

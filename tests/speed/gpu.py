@@ -1,0 +1,138 @@
+"""A stack on a GPU: does a captured update equal a plain one, and what do many runs gain over one?
+
+    python -m tests.speed.gpu --out docs/benchmarks-gpu.json --seconds 480
+
+Every figure is written as soon as it is measured; the same command goes on with those that are missing, so that a
+machine that is lent for minutes at a time is enough. On a CPU it does the same with small stacks (a rehearsal).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import datetime
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from offbench.calibrate import made_up
+from offbench.devices import arithmetic, pick_device
+from offbench.files import write_json
+from offbench.provenance import versions
+from offbench.recipes import load_recipe
+from offbench.registry import load_algorithm
+from offbench.settings import build
+from offbench.stack import Stack
+
+MEASURE = 5.0  # seconds of a figure
+STACKS = (1, 5, 25, 125, 250)
+ALGORITHMS = ("bdb", "td3_bc", "cql")
+
+
+def stack_of(algorithm: str, runs: int, device: str, *, captured: bool = True, **settings: Any) -> Stack:
+    """Return a stack on random transitions of hopper's shapes; runs differ in seed and, for BDB, in beta."""
+    kind = load_algorithm(algorithm)
+    settings = {"hidden": "256,256"} | ({"bc_steps": 0} if algorithm == "cql" else {}) | settings
+    betas = [0.0, 0.25, 0.5, 0.75, "adaptive"] if algorithm == "bdb" else [None]
+    spec = load_recipe("hopper").env_spec()
+    member = made_up(algorithm, build(kind.Config, settings, algorithm), spec)
+    members = []
+    for seed in range(runs):
+        own = settings if betas[0] is None else settings | {"beta": betas[seed % len(betas)]}
+        members.append(dataclasses.replace(member, seed=seed, config=build(kind.Config, own, algorithm)))
+    stack = Stack(kind, members, device)
+    if not captured:
+        stack.program._side = None
+    return stack
+
+
+def rate(algorithm: str, runs: int, device: str, *, captured: bool, tf32: bool) -> dict[str, float]:
+    """Return the sum of all runs' updates a second, and the peak memory in MB."""
+    gpu = device != "cpu"
+    if gpu:
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+    with arithmetic(device, tf32):
+        stack = stack_of(algorithm, runs, device, captured=captured)
+        advance(stack, 100)
+        done, began = 0, time.perf_counter()
+        while time.perf_counter() - began < MEASURE:
+            done += advance(stack, 100)
+        spent = time.perf_counter() - began
+    memory = torch.cuda.max_memory_allocated() / 1e6 if gpu else 0.0
+    return {"updates_per_second": runs * done / spent, "stack_updates_per_second": done / spent, "memory_mb": memory}
+
+
+def advance(stack: Stack, updates: int) -> int:
+    """Do so many updates and wait for them."""
+    for _ in stack.train(stack.step + updates):
+        pass
+    stack.logged()
+    return updates
+
+
+def equality(algorithm: str, device: str) -> dict[str, float]:
+    """Return the largest difference of the weights after 50 updates: captured against plain, stack against alone."""
+    with arithmetic(device, tf32=False):
+        stacks = [
+            stack_of(algorithm, 5, device),
+            stack_of(algorithm, 5, device, captured=False),
+            stack_of(algorithm, 1, device),
+        ]
+        for stack in stacks:
+            advance(stack, 50)
+    together, plain, alone = (stack.run_tensors(0) for stack in stacks)
+    return {
+        "captured_against_plain": max(float((together[n] - plain[n]).abs().max()) for n in together),
+        "stack_against_alone": max(float((together[n] - alone[n]).abs().max()) for n in together),
+    }
+
+
+def figures(device: str) -> dict[str, Callable[[], dict[str, float]]]:
+    """Return what is measured, by name."""
+    sizes = STACKS if device != "cpu" else STACKS[:2]
+    found: dict[str, Callable[[], dict[str, float]]] = {}
+    for algorithm in ALGORITHMS:
+        found[f"equality {algorithm}"] = lambda a=algorithm: equality(a, device)  # type: ignore[misc]
+        found[f"{algorithm}, 1 run, plain"] = lambda a=algorithm: rate(a, 1, device, captured=False, tf32=False)  # type: ignore[misc]
+        for runs in sizes[: 4 if algorithm == "cql" else None]:
+            for tf32 in (False, True):
+                name = f"{algorithm}, {runs} runs, captured{', TF32' if tf32 else ''}"
+                found[name] = lambda a=algorithm, r=runs, t=tf32: rate(a, r, device, captured=True, tf32=t)  # type: ignore[misc]
+    return found
+
+
+def main() -> None:
+    """Measure what is missing, for as long as there is time."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks-gpu.json"))
+    parser.add_argument("--seconds", type=float, default=480.0, help="after which no new figure is begun")
+    parser.add_argument("--device", default="auto")
+    arguments = parser.parse_args()
+    device, began = pick_device(arguments.device), time.monotonic()
+    name = torch.cuda.get_device_name() if device != "cpu" else "cpu"
+    known: dict[str, Any] = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
+    if known.get("device", name) != name:
+        raise SystemExit(f"{arguments.out} has figures of {known['device']}, this is {name}; give another --out")
+    known |= {"device": name, "date": datetime.date.today().isoformat(), "versions": versions()}
+    results = known.setdefault("figures", {})
+    for what, measure in figures(device).items():
+        if what in results:
+            continue
+        if time.monotonic() - began > arguments.seconds:
+            print("out of time; the same command goes on")
+            break
+        try:
+            results[what] = measure()
+        except torch.cuda.OutOfMemoryError:
+            results[what] = {"out_of_memory": 1.0}
+        print(what, results[what], flush=True)
+        write_json(arguments.out, known)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,253 @@
+"""offbench's sides and those of the libraries it is built on. Run as `python -m tests.speed.sides NAME key=value`."""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tests.speed.side import Work, serve
+
+ENV = "hopper"
+BATCH, HIDDEN = 256, (256, 256)
+
+
+def train(algorithm: str, runs: str = "1", rows: str = "100000", hidden: str = "256,256") -> Work:
+    """Updates of a stack; a unit is one run's update."""
+    import torch
+
+    from offbench.registry import load_algorithm
+    from offbench.settings import build
+    from offbench.stack import Stack
+
+    torch.set_num_threads(1)
+    kind = load_algorithm(algorithm)
+    config: Any = build(kind.Config, {"hidden": hidden} | ({"bc_steps": 0} if algorithm == "cql" else {}), algorithm)
+    member = _member(algorithm, config, int(rows))
+    stack = Stack(kind, [member] * int(runs), "cpu")
+    few = 5 if algorithm == "cql" else 100
+
+    def work() -> int:
+        for _ in stack.train(stack.step + few):
+            pass
+        return few * int(runs)
+
+    return work
+
+
+def _member(algorithm: str, config: Any, rows: int) -> Any:
+    """A run on random transitions of hopper's shapes."""
+    from offbench import calibrate
+    from offbench.recipes import load_recipe
+
+    calibrate.ROWS = rows
+    return calibrate.made_up(algorithm, config, load_recipe(ENV).env_spec())
+
+
+def products(algorithm: str) -> Work:
+    """The matrix products of an update and nothing else; a unit is one update."""
+    import torch
+
+    from tests.speed.arithmetic import ALGORITHMS
+
+    torch.set_num_threads(1)
+    counted: dict[Any, float] = {}
+    for often, product in ALGORITHMS[algorithm](11, 3, BATCH, HIDDEN):
+        counted[product] = counted.get(product, 0) + often
+    tensors = []
+    for (copies, m, k, n), often in counted.items():
+        a, b, out = torch.randn(copies, m, k), torch.randn(copies, k, n), torch.empty(copies, m, n)
+        tensors += [(a, b, out)] * round(2 * often)  # two updates: some come every second one
+
+    def work() -> int:
+        for a, b, out in tensors:
+            torch.bmm(a, b, out=out)
+        return 2
+
+    return work
+
+
+def record(workers: str) -> Work:
+    """`offbench collect`, from the command to the Minari dataset; a unit is one transition."""
+    from offbench.record import collect
+
+    def work() -> int:
+        collect(ENV, "medium", steps=200_000, workers=int(workers), overwrite=True)
+        return 200_000
+
+    return work
+
+
+def sb3_collector() -> Work:
+    """A loop of SB3's predict over Minari's DataCollector, the same policy; a unit is one transition."""
+    import gymnasium as gym
+    from minari import DataCollector
+
+    model = sb3_model("medium")
+    env = DataCollector(gym.make("Hopper-v5"))
+    numbers = itertools.count()
+
+    def work() -> int:
+        done = 0
+        while done < 3000:
+            observation, _ = env.reset(seed=next(numbers))
+            over = False
+            while not over:
+                action, _ = model.predict(observation, deterministic=False)
+                observation, _, terminated, truncated, _ = env.step(action)
+                done, over = done + 1, terminated or truncated
+        name = f"loop{next(numbers)}-v0"
+        env.create_dataset(dataset_id=name, algorithm_name="SAC", description="a loop", eval_env="Hopper-v5")
+        shutil.rmtree(Path(os.environ["MINARI_DATASETS_PATH"]) / name)
+        return done
+
+    return work
+
+
+def sb3_model(level: str) -> Any:
+    """An SB3 agent with the weights of a shipped policy."""
+    import torch
+    from stable_baselines3 import SAC
+
+    from offbench.ladder import read_ladder
+    from offbench.recipes import load_recipe
+
+    torch.set_num_threads(1)
+    recipe = load_recipe(ENV)
+    assert recipe.folder is not None
+    ladder = read_ladder(recipe.folder / "behaviour")
+    assert ladder is not None
+    policy = ladder.load(ladder.role(level))
+    model = SAC("MlpPolicy", recipe.env_id, buffer_size=10, policy_kwargs={"net_arch": [256, 256]}, device="cpu")
+    actor: Any = model.policy.actor
+    *hidden, (weight, bias) = policy.layers
+    halves = [(weight[:, :3], bias[:3]), (weight[:, 3:], bias[3:])]
+    with torch.no_grad():
+        for layer, (w, b) in zip(
+            [actor.latent_pi[0], actor.latent_pi[2], actor.mu, actor.log_std], [*hidden, *halves], strict=True
+        ):
+            layer.weight.copy_(torch.tensor(w).T)
+            layer.bias.copy_(torch.tensor(b))
+    return model
+
+
+def physics(workers: str) -> Work:
+    """mj_step alone, in so many processes, along recorded episodes; a unit is one step of the environment."""
+    from offbench.record import collect
+
+    name = collect(ENV, "medium", steps=2000, workers=1, overwrite=True, dataset_id="physics-v0")
+    count = int(workers)
+    go, done = multiprocessing.Semaphore(0), multiprocessing.Queue()  # type: ignore[var-annotated]
+    for _ in range(count):
+        multiprocessing.Process(target=_physics, args=(name, go, done), daemon=True).start()
+
+    def work() -> int:
+        for _ in range(count):
+            go.release()
+        return sum(done.get() for _ in range(count))
+
+    return work
+
+
+def _physics(name: str, go: Any, done: Any) -> None:
+    import gymnasium as gym
+    import minari
+    import mujoco
+
+    env: Any = gym.make("Hopper-v5").unwrapped
+    model, data = env.model, env.data
+    episodes = list(minari.load_dataset(name).iterate_episodes())
+    while go.acquire():
+        steps = 0
+        for episode in episodes:
+            env.reset(seed=int(episode.seed) if hasattr(episode, "seed") else 0)
+            for action in episode.actions:
+                data.ctrl[:] = action
+                mujoco.mj_step(model, data, nstep=env.frame_skip)
+            steps += len(episode.actions)
+        done.put(steps)
+
+
+def load_cached(dataset_id: str) -> Work:
+    """offbench.load of a dataset that is in the cache, every number read; a unit is one load."""
+    import offbench
+
+    def work() -> int:
+        data = offbench.load(dataset_id)
+        for array in (data.observations, data.rows, data.actions, data.rewards, data.masks):
+            array.sum()
+        return 1
+
+    return work
+
+
+def load_minari(dataset_id: str) -> Work:
+    """Minari's iterate_episodes over the same dataset, every number read; a unit is one load."""
+    import minari
+
+    def work() -> int:
+        for episode in minari.load_dataset(dataset_id).iterate_episodes():
+            for array in (episode.observations, episode.actions, episode.rewards, episode.terminations):
+                array.sum()
+        return 1
+
+    return work
+
+
+def evaluate(workers: str, episodes: str = "20") -> Work:
+    """offbench's evaluation of the expert; a unit is one episode."""
+    from offbench.ladder import read_ladder
+    from offbench.recipes import load_recipe
+    from offbench.rollout import Rollouts, result
+
+    recipe = load_recipe(ENV)
+    assert recipe.folder is not None
+    ladder = read_ladder(recipe.folder / "behaviour")
+    assert ladder is not None
+    policy = ladder.load(ladder.role("expert"))
+    rollouts = Rollouts(recipe.env_spec(), int(workers))
+    numbers = itertools.count()
+
+    def work() -> int:
+        return len(result(rollouts.outcomes(policy, next(numbers), (0,), int(episodes), True)))
+
+    return work
+
+
+def sb3_evaluate(episodes: str = "5") -> Work:
+    """SB3's evaluate_policy of the same expert; a unit is one episode."""
+    import gymnasium as gym
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.monitor import Monitor
+
+    model, env = sb3_model("expert"), Monitor(gym.make("Hopper-v5"))
+
+    def work() -> int:
+        evaluate_policy(model, env, n_eval_episodes=int(episodes))
+        return int(episodes)
+
+    return work
+
+
+SIDES: dict[str, Callable[..., Work]] = {
+    side.__name__: side
+    for side in (
+        train,
+        products,
+        record,
+        sb3_collector,
+        physics,
+        load_cached,
+        load_minari,
+        evaluate,
+        sb3_evaluate,
+    )
+}
+
+if __name__ == "__main__":
+    serve(SIDES[sys.argv[1]])

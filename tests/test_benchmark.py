@@ -1,0 +1,232 @@
+"""A grid: what it says, what it costs, how it goes on, and how it is shared."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import offbench
+from offbench import benchmark, dataset
+from offbench.cli import main
+from offbench.errors import OffbenchError
+from offbench.grid import load_grid, shipped_grids
+from offbench.runs import Run, find_runs
+from offbench.tables import score_runs
+
+GRID = """
+datasets = ["DATASET"]
+seeds = 2
+steps = 200
+eval_every = 100
+eval_episodes = 2
+
+[[algorithms]]
+name = "td3_bc"
+hidden = [16, 16]
+batch_size = 32
+
+[[algorithms]]
+name = "bdb"
+hidden = [16, 16]
+batch_size = 32
+beta = [0.5, "adaptive"]
+seeds = [7]
+steps = 100
+"""
+
+
+@pytest.fixture
+def grid(medium: str, home: Path) -> str:
+    """A grid file on the tiny dataset: two runs of TD3+BC, two of BDB."""
+    (home / "grid.toml").write_text(GRID.replace("DATASET", medium))
+    return "./grid.toml"
+
+
+def silent(_: str) -> None:
+    """Take a line of the plan and drop it."""
+
+
+def test_the_papers_grid_is_its_table() -> None:
+    """15 datasets x (TD3+BC, CQL, four BDB) x 5 seeds = 450 runs of a million updates."""
+    bench = benchmark.prepare("paper", workers=1)
+    assert sum(len(bench.orders(one)) for one in bench.variants) == 450
+    assert {one.times.steps for one in bench.variants} == {1_000_000}
+    assert {one.times.eval_every for one in bench.variants} == {5_000}
+    assert [one.name for one in bench.variants] == [
+        "td3_bc",
+        "bdb beta=0.25",
+        "bdb beta=0.5",
+        "bdb beta=0.75",
+        "bdb",
+        "cql",
+    ]
+    assert {source.env for source in bench.grid.datasets} == {"hopper", "halfcheetah", "walker2d"}
+    assert {source.level for source in bench.grid.datasets} == set(offbench.inventory()["levels"])
+
+
+@pytest.mark.parametrize("name", shipped_grids())
+def test_shipped_grids_are_sound_and_their_plan_counts_what_is_left(name: str) -> None:
+    bench = benchmark.prepare(name, workers=2)
+    first, *lines = benchmark.plan(bench)
+    runs = sum(len(bench.orders(one)) for one in bench.variants)
+    assert (
+        first
+        == f"{name}: {len(bench.grid.datasets)} datasets, {len(bench.variants)} variants, {runs} runs, {runs} to train"
+    )
+    assert any("to record first" in line for line in lines)
+    assert "on 2 processes of one thread about" in lines[-2]
+
+
+def test_a_finished_grid_is_left_alone(grid: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert benchmark.benchmark(grid, workers=1, say=silent)
+    runs = find_runs(home / "runs")
+    assert {(r.config()["algorithm"], r.config()["seed"], r.config()["steps"]) for r in runs} == {
+        ("td3_bc", 0, 200),
+        ("td3_bc", 1, 200),
+        ("bdb", 7, 100),
+    }
+    assert len(runs) == 4
+    before = {run.folder: run.policy_path.stat().st_mtime_ns for run in runs}
+    main(["benchmark", grid, "--workers", "1"])
+    assert {run.folder: run.policy_path.stat().st_mtime_ns for run in runs} == before
+    said = capsys.readouterr().out
+    assert "4 runs, 0 to train" in said
+    assert "td3_bc" in said.splitlines()[-1]
+
+
+def test_missing_datasets_are_recorded_first(home: Path) -> None:
+    text = GRID.replace('"DATASET"', '{id = "mine-v0", env = "inverted-pendulum", level = "random", steps = 500}')
+    (home / "grid.toml").write_text(text)
+    assert benchmark.benchmark("./grid.toml", workers=1, say=silent)
+    assert dataset.read_metadata("mine-v0")["total_steps"] == 500
+
+
+def test_a_budget_stops_cleanly_and_the_same_call_goes_on(grid: str) -> None:
+    assert not benchmark.benchmark(grid, workers=1, budget="0.001s", say=silent)
+    assert benchmark.benchmark(grid, workers=1, budget="1h", say=silent)
+
+
+def test_shards_share_the_runs_and_together_are_the_grid(grid: str, home: Path) -> None:
+    benchmark.benchmark(grid, workers=1, say=silent, runs="whole", stack=1)
+    for place in range(3):
+        benchmark.benchmark(grid, workers=1, say=silent, runs="shared", stack=1, shard=(place, 3))
+        counted = len([run for run in find_runs(home / "shared") if run.evaluations()])
+        assert counted == (2, 3, 4)[place]  # four stacks of one run dealt to three
+    for run in find_runs(home / "whole"):
+        other = Run(home / "shared" / run.folder.relative_to(home / "whole"))
+        assert run.evaluations() == other.evaluations()
+        assert run.policy_path.read_bytes() == other.policy_path.read_bytes()
+
+
+BAD: dict[str, tuple[str, str]] = {
+    "no TOML": ("datasets = [", "not a readable TOML file"),
+    "no datasets": ('datasets = []\n[[algorithms]]\nname = "bc"', "datasets must be a list"),
+    "no algorithms": ('datasets = ["a-v0"]', "algorithms must be a list"),
+    "unknown key": ('datasets = ["a-v0"]\nstep = 3\n[[algorithms]]\nname = "bc"', "did you mean 'steps'"),
+    "bad seeds": (
+        'datasets = ["a-v0"]\nseeds = [1, 1]\n[[algorithms]]\nname = "bc"',
+        "seeds must be a count or a list",
+    ),
+    "no seeds": ('datasets = ["a-v0"]\nseeds = 0\n[[algorithms]]\nname = "bc"', "seeds must be a count or a list"),
+    "bad steps": ('datasets = ["a-v0"]\nsteps = 0\n[[algorithms]]\nname = "bc"', "steps must be at least 1"),
+    "bad id": ('datasets = ["a"]\n[[algorithms]]\nname = "bc"', "is not a dataset id"),
+    "twice": ('datasets = ["a-v0"]\n[[algorithms]]\nname = "bc"\n[[algorithms]]\nname = "bc"', "comes twice"),
+    "dataset twice": ('datasets = ["a-v0", "a-v0"]\n[[algorithms]]\nname = "bc"', "a dataset comes twice"),
+    "no name": ('datasets = ["a-v0"]\n[[algorithms]]\nbeta = 1', "needs a name"),
+    "unknown algorithm": ('datasets = ["a-v0"]\n[[algorithms]]\nname = "td3bc"', "did you mean 'td3_bc'"),
+    "unknown setting": ('datasets = ["a-v0"]\n[[algorithms]]\nname = "bdb"\nbta = 1', "did you mean 'beta'"),
+    "bad level": (
+        'datasets = [{id = "a-v0", env = "hopper", level = "medim"}]\n[[algorithms]]\nname = "bc"',
+        "'medium'",
+    ),
+    "unknown source": ('datasets = ["strange-v0"]\n[[algorithms]]\nname = "bc"', "strange-v0"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_a_bad_grid_is_one_line(fault: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, message = BAD[fault]
+    (home / "grid.toml").write_text(text)
+    with pytest.raises(SystemExit) as end:
+        main(["benchmark", "./grid.toml"])
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["papr"], "did you mean 'paper'"),
+        (["./nothing.toml"], "no grid file"),
+        (["smoke", "--budget", "9"], "a budget is a time"),
+        (["smoke", "--budget=-9m"], "a budget must be more than nothing"),
+        (["smoke", "--shard", "3"], "no share like 0/4"),
+        (["smoke", "--stack", "0"], "whole number from 1"),
+    ],
+)
+def test_bad_words_are_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["benchmark", *words])
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_shard_beyond_the_last_is_refused(grid: str) -> None:
+    with pytest.raises(OffbenchError, match="a shard is i/n"):
+        benchmark.benchmark(grid, shard=(2, 2), workers=1, say=silent)
+
+
+@pytest.mark.parametrize(
+    ("text", "env", "level"),
+    [
+        ("hopper-medium-replay-v0", "hopper", "medium-replay"),
+        ("inverted-pendulum-60percent-v1", "inverted-pendulum", "0.6"),
+        ("hopper-12p5percent-v0", "hopper", "0.125"),
+        ("D4RL/hopper/medium-v2", "", ""),
+    ],
+)
+def test_an_id_tells_how_it_is_recorded(text: str, env: str, level: str, home: Path) -> None:
+    (home / "grid.toml").write_text(f'datasets = ["{text}"]\n[[algorithms]]\nname = "bc"')
+    (source,) = load_grid("./grid.toml").datasets
+    assert (source.env, source.level) == (env, level)
+
+
+@pytest.mark.slow
+def test_smoke_survives_five_kill_9(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed at random moments, recordings and trainings: the table is an undisturbed one's."""
+
+    def table(place: str) -> list[dict[str, Any]]:
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(home / place / "minari"))
+        return score_runs(home / place / "runs")
+
+    def command(place: str) -> list[str]:
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(home / place / "minari"))
+        return [sys.executable, "-m", "offbench", "benchmark", "smoke", "--runs", f"{place}/runs", "--workers", "2"]
+
+    began = time.monotonic()
+    subprocess.run(command("whole"), check=True, capture_output=True)
+    took, rng, kills, undisturbed = time.monotonic() - began, random.Random(0), 0, table("whole")
+    while kills < 5:  # the fifth may come in a second grid
+        shutil.rmtree(home / "killed", ignore_errors=True)
+        done = False
+        while not done:
+            process = subprocess.Popen(command("killed"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            try:
+                done = process.wait(rng.uniform(0.3, 1.0) * took if kills < 5 else None) == 0
+                assert done
+            except subprocess.TimeoutExpired:
+                process.send_signal(signal.SIGKILL)
+                process.wait()
+                kills += 1
+                time.sleep(1.5)  # its workers notice within a second that it is gone
+        assert json.dumps(table("killed")) == json.dumps(undisturbed)

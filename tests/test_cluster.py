@@ -1,0 +1,118 @@
+"""A benchmark on a real Ray cluster of two nodes: the same results as on this machine, whatever dies."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from offbench import benchmark, cluster
+from offbench.errors import OffbenchError
+from offbench.runs import Run, find_runs
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
+
+GRID = """
+seeds = 2
+eval_every = 500
+eval_episodes = 2
+datasets = [{id = "mine-v0", env = "inverted-pendulum", level = "medium", steps = 1_000}]
+
+[[algorithms]]
+name = "bdb"
+steps = 3_000
+hidden = [32, 32]
+"""
+
+
+@pytest.fixture
+def two_nodes(home: Path) -> Iterator[Any]:
+    """A head without processors and two nodes with one each; yields (cluster, nodes)."""
+    import ray
+    from ray.cluster_utils import Cluster
+
+    (home / "grid.toml").write_text(GRID)
+    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    try:
+        workers = [nodes.add_node(num_cpus=1) for _ in range(2)]
+        ray.init(address=nodes.address, log_to_driver=False)
+        yield nodes, workers
+    finally:
+        ray.shutdown()
+        nodes.shutdown()
+
+
+def run(where: str, executor: Any) -> bool:
+    return benchmark.benchmark(
+        "./grid.toml", runs=where, workers=2, stack=1, device="cpu", executor=executor, say=lambda line: None
+    )
+
+
+def same(home: Path, ours: str, theirs: str) -> None:
+    runs = find_runs(home / ours)
+    assert len(runs) == 2
+    for one in runs:
+        other = Run(home / theirs / one.folder.relative_to(home / ours))
+        assert one.evaluations_path.read_bytes() == other.evaluations_path.read_bytes()
+        assert one.policy_path.read_bytes() == other.policy_path.read_bytes()
+        newest = "checkpoint-000003000.safetensors"
+        assert (one.folder / newest).read_bytes() == (other.folder / newest).read_bytes()
+
+
+def test_a_lost_node_changes_nothing(two_nodes: Any, home: Path) -> None:
+    """Slices of two seconds; a node is killed while both are at work, and another one joins."""
+    nodes, workers = two_nodes
+    assert run("local", None)
+    killed: list[float] = []
+
+    def kill() -> None:
+        while not any((home / "ray").rglob("checkpoint-*")):
+            time.sleep(0.1)
+        nodes.remove_node(workers[0], allow_graceful=False)
+        killed.append(time.monotonic())
+        nodes.add_node(num_cpus=1)
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    assert run("ray", cluster.RayExecutor(nodes.address, slice_seconds=2))
+    ended = time.monotonic()
+    thread.join()
+    assert killed[0] < ended
+    same(home, "local", "ray")
+
+
+def test_nodes_that_share_no_disk_fetch_and_bring_back(
+    two_nodes: Any, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The token's content is not what the nodes find: as on a node with another disk at the same path."""
+    import shutil
+
+    nodes, _ = two_nodes
+    assert run("local", None)
+    shutil.rmtree(home / "minari")  # to be recorded on a node as well
+
+    @contextmanager
+    def foreign(folder: Path) -> Iterator[str]:
+        yield f"{folder}/no-such-token\n"
+
+    monkeypatch.setattr(cluster, "_token", foreign)
+    assert run("ray", cluster.RayExecutor(nodes.address, slice_seconds=2))
+    same(home, "local", "ray")
+
+
+def test_what_fails_on_a_node_is_said_here(two_nodes: Any, home: Path) -> None:
+    nodes, _ = two_nodes
+    (home / "grid.toml").write_text(GRID.replace('env = "inverted-pendulum"', 'env = "./gone.toml"'))
+    source = benchmark.load_grid("./grid.toml").datasets
+    with pytest.raises(OffbenchError, match="no recipe file"):
+        cluster.RayExecutor(nodes.address).record(source, 1)
+
+
+def test_a_cluster_that_is_not_there_is_one_line() -> None:
+    with pytest.raises(OffbenchError, match="no Ray cluster at"):
+        cluster.RayExecutor("127.0.0.1:1")

@@ -1,0 +1,293 @@
+"""The report of made-up runs: every part is there, every name is text, and the same runs give the same bytes."""
+
+from __future__ import annotations
+
+import importlib.resources
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import offbench
+from offbench import assess, reporting
+from offbench.cli import main
+from offbench.files import write_json
+from offbench.report_tables import published
+from offbench.results import Method, Task, read_results
+from tests.made_runs import METHODS, made_grid, made_run
+from tests.pages import Page, rows
+
+
+def test_a_whole_grid(home: Path) -> None:
+    made_grid(home / "runs", seeds=3, levels=2)
+    page = Page(offbench.report(home / "runs", home / "out"))
+    for section in (
+        "scores",
+        "aggregate",
+        "improvement",
+        "curves",
+        "finals",
+        "beside",
+        "similarity",
+        "beta",
+        "critic",
+    ):
+        assert section in page.ids
+    assert len(page.ids) == len(set(page.ids))
+    links = [a["href"] or "" for name, a in page.elements if name == "a"]
+    inside = [link for link in links if not link.startswith("#")]
+    assert inside
+    assert all((home / "out" / link).is_file() for link in inside)
+    assert {link[1:] for link in links if link.startswith("#")} <= set(page.ids)
+    boxes = [a["data-box"] for name, a in page.elements if name == "button" and "data-box" in a]
+    assert len(boxes) == len(set(boxes)) == 2 * len(METHODS)
+    assert set(boxes) <= set(page.ids)
+    assert "The datasets are not the same" in page.text
+    assert "over 3 seeds" in page.text
+    stems = {path.stem for path in (home / "out" / "figures").iterdir()}
+    assert {"iqm", "profiles", "curves-iqm", "curves-hopper-random-v0", "beta-hopper-random-v0"} <= stems
+    for stem in stems:
+        assert (home / "out" / "figures" / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
+        assert b"<svg" in (home / "out" / "figures" / f"{stem}.svg").read_bytes()
+
+
+def test_the_score_table_by_hand(home: Path) -> None:
+    for seed, value in enumerate((40.0, 50.0, 90.0)):
+        run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", seed, 0)
+        run.write_evaluations({30_000: [(value, 5)]})
+    run = made_run(home / "runs", "hopper-medium-v0", "bdb", "default", 0, 0, settings={"beta": "adaptive"})
+    run.write_evaluations({20_000: [(70.0, 5)]})
+    offbench.report(home / "runs", home / "out")
+    ((row),) = rows(home / "out" / "tables" / "scores.csv")
+    assert row["level"] == "medium"
+    assert row["environment"] == "hopper"
+    assert (
+        row["td3_bc (30,000 steps)"] == "60.0 ± 26.5 (3 seeds)"
+    )  # deviation of 40, 50, 90: sqrt((400 + 100 + 900) / 2)
+    assert row["bdb beta=adaptive (20,000 of 30,000 steps)"] == "70.0 ± ? † (1 seed)"
+    latex = (home / "out" / "tables" / "scores.tex").read_text()
+    assert r"60.0 $\pm$ 26.5 (3 seeds) & \textbf{70.0 $\pm$ ? $\dagger$ (1 seed)}" in latex
+    assert "**70.0 ± ? † (1 seed)**" in (home / "out" / "tables" / "scores.md").read_text()
+    # D4RL's reference of the made runs is -10 to 190: a return of 70 is 100 * 80 / 200
+    beside = {row["method"]: row for row in rows(home / "out" / "tables" / "beside.csv")}
+    assert beside["bdb beta=adaptive"]["ours (D4RL's constants)"] == "40.0 ± ?"
+    paper = "BDB paper, Table 1, v0 (5 seeds, mean of last 10 evaluations, 1M steps)"
+    assert beside["bdb beta=adaptive"][paper] == "100.16 ± 0.02"
+    page = (home / "out" / "index.html").read_text()
+    assert "paper 100.16" in page
+    assert ">3 seeds<" in page
+    assert ">1 seed<" in page
+
+
+def test_tasks_and_methods_in_the_papers_order(home: Path) -> None:
+    for dataset in ("walker2d-medium-v0", "hopper-expert-v0", "hopper-medium-v0", "hopper-random-v0", "a-random-v0"):
+        made_run(home / "runs", dataset, "bc", "default", 0, 50)
+    for algorithm, variant, settings, _ in METHODS:
+        made_run(home / "runs", "hopper-medium-v0", algorithm, variant, 0, 50, settings=settings)
+    results = read_results(home / "runs")
+    levels = ["hopper-random-v0", "a-random-v0", "hopper-medium-v0", "walker2d-medium-v0", "hopper-expert-v0"]
+    assert [task.dataset for task in results.tasks] == levels
+    labels = ["td3_bc", "cql", "bdb beta=0.25", "bdb beta=0.5", "bdb beta=0.75", "bdb beta=adaptive", "bc"]
+    assert [method.label for method in results.methods] == labels
+
+
+@pytest.mark.parametrize(
+    ("dataset", "place"),
+    [
+        ("hopper-medium-replay-v0", ("hopper", "medium-replay")),
+        ("hopper-medium-expert-v0", ("hopper", "medium-expert")),
+        ("mujoco/walker2d/medium-expert-v0", ("walker2d", "medium-expert")),
+        ("inverted-pendulum-medium-v3", ("inverted-pendulum", "medium")),
+        ("hopper-60percent-v0", ("hopper", "60percent")),
+        ("mujoco/hopper/expert-v0", ("hopper", "expert")),
+        ("my-data-v0", ("my-data", "")),
+    ],
+)
+def test_environment_and_level_of_a_dataset(dataset: str, place: tuple[str, str]) -> None:
+    assert Task(dataset, "", None).place == place
+
+
+def test_the_published_numbers_are_found_by_method() -> None:
+    assert Method("bdb", "beta=0.5", "0.50").published == "bdb beta=0.50"
+    known = {row["method"] for row in published("scores")}
+    assert {"td3_bc", "cql", "bdb beta=0.50", "bdb beta=adaptive"} <= known
+    assert Method("bdb", "hidden=8x8", "adaptive").label == "bdb beta=adaptive,hidden=8x8"
+
+
+def test_one_run_of_one_seed(home: Path) -> None:
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    page = Page(offbench.report(run.folder, home / "out"))  # the run's own folder will do
+    assert "scores" in page.ids
+    assert "improvement" not in page.ids
+    assert "± ?" in page.text
+    ((row),) = rows(home / "out" / "tables" / "iqm.csv")
+    assert (row["95% low"], row["tasks"], row["runs"]) == ("-", "1", "1")
+
+
+def test_runs_without_references_show_returns(home: Path) -> None:
+    made_run(home / "runs", "my-data-v0", "td3_bc", "default", 0, 1234, references=(None, None), noise=0.01)
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert "raw return" in page.text
+    assert "aggregate" not in page.ids  # returns are not averaged over tasks
+    ((row),) = rows(home / "out" / "tables" / "scores.csv")
+    assert row["td3_bc (30,000 steps)"].startswith("return 1")
+
+
+def test_only_d4rls_reference_is_named(home: Path) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, references=(None, [0.0, 100.0]))
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert "normalised by D4RL's constants" in page.text
+
+
+def test_unfinished_and_unbegun_runs_are_marked(home: Path) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, reached=10_000)
+    made_run(home / "runs", "hopper-medium-v0", "cql", "default", 0, 50, reached=0)
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert "10,000 of 30,000 steps" in page.text
+    assert "not finished" in page.text
+    assert "hopper-medium-v0/cql/default/seed-0" in page.text
+    states = {row["method"]: row["state"] for row in rows(home / "out" / "tables" / "seeds.csv")}
+    assert states == {"td3_bc": "unfinished", "cql": "not evaluated yet"}
+
+
+def test_a_diverged_run_is_marked(home: Path) -> None:
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, reached=10_000)
+    run.mark_diverged(12_000, "critic.0")
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert "1 of 1 runs diverged." in page.text
+    assert "became NaN or infinite" in page.text
+    ((row),) = rows(home / "out" / "tables" / "scores.csv")
+    assert row["td3_bc (10,000 of 30,000 steps)"].endswith("± ? ‡")
+    ((row),) = rows(home / "out" / "tables" / "seeds.csv")
+    assert row["state"] == "diverged"
+
+
+def test_a_dataset_recorded_twice_is_two_rows(home: Path) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 1, 50)
+    config = json.loads(run.config_path.read_text())
+    write_json(run.config_path, config | {"dataset_sha256": "abcd1234ef"})
+    offbench.report(home / "runs", home / "out")
+    assert len(rows(home / "out" / "tables" / "scores.csv")) == 2
+    assert "hopper-medium-v0 (abcd1234)" in (home / "out" / "index.html").read_text()
+
+
+def test_a_run_that_is_there_twice_is_refused(home: Path) -> None:
+    made_run(home / "runs" / "a", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    shutil.copytree(home / "runs" / "a", home / "runs" / "b")
+    with pytest.raises(offbench.OffbenchError, match="the same run twice"):
+        offbench.report(home / "runs", home / "out")
+    assert not (home / "out").exists()
+
+
+def test_a_real_training(medium: str, home: Path) -> None:
+    """Whatever the training writes is understood: settings, losses, evaluations, the similar score."""
+    sizes = {"steps": 40, "eval_every": 20, "eval_episodes": 2, "hidden": (8,), "batch_size": 8, "workers": 1}
+    folders = offbench.train("bdb", medium, seeds=range(2), beta=[0.25, "adaptive"], **sizes)
+    folders += offbench.train("td3_bc", medium, **sizes)
+    for folder in folders:
+        assess.similarity(folder, samples=256)
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert {"scores", "improvement", "similarity", "beta", "critic"} <= set(page.ids)
+    ((row),) = rows(home / "out" / "tables" / "scores.csv")
+    assert (row["level"], row["environment"]) == ("medium", "tiny")
+    assert any(name.startswith("bdb beta=adaptive,") for name in row)
+    (found,) = [
+        r for r in rows(home / "out" / "tables" / "similarity-details.csv") if r["method"].startswith("td3_bc")
+    ]
+    written = json.loads((folders[-1] / "similarity.json").read_text())
+    assert found["by Q (%)"] == f"{written['q_similar']:.1f} ± ?"
+
+
+def test_a_file_where_the_report_should_be(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    (home / "taken").touch()
+    with pytest.raises(SystemExit) as stopped:
+        main(["report", "--out", "taken"])
+    assert stopped.value.code == 2
+    assert "taken is a file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [{"references": None}, {"references": {"dataset": [0, 0]}}, {"references": {"d4rl": ["a", "b"]}}, {"seed": "0"}],
+)
+def test_a_damaged_config_is_said(home: Path, damage: dict[str, Any]) -> None:
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    write_json(run.config_path, json.loads(run.config_path.read_text()) | damage)
+    with pytest.raises(offbench.OffbenchError, match=r"config\.json is damaged"):
+        offbench.report(home / "runs", home / "out")
+
+
+def test_losses_that_are_not_finite_are_drawn_as_gaps(home: Path) -> None:
+    run = made_run(home / "runs", "hopper-medium-v0", "bdb", "default", 0, 50)
+    run.write_losses([{"step": 1000.0 * i, "q_abs": q} for i, q in enumerate((1.0, math.inf, 2.0, math.nan, 3.0))])
+    assert "critic" in Page(offbench.report(home / "runs", home / "out")).ids
+    run.write_losses([{"q_abs": 1.0}])  # without steps there is nothing to draw
+    assert "critic" not in Page(offbench.report(home / "runs", home / "out")).ids
+
+
+def test_damaged_similarity_is_said(home: Path) -> None:
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    for text in ("[]", '{"q_similar": "much"}', "{"):
+        (run.folder / "similarity.json").write_text(text)
+        with pytest.raises(offbench.OffbenchError, match="damaged"):
+            offbench.report(home / "runs", home / "out")
+
+
+def test_the_same_runs_give_the_same_bytes(home: Path) -> None:
+    made_grid(home / "runs", seeds=2, levels=2)
+    shutil.copytree(home / "runs", home / "elsewhere")
+    for runs, out in (("runs", "one"), ("elsewhere", "two")):
+        main(["report", "--runs", runs, "--out", out])
+    first, second = (
+        {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+        for root in (home / "one", home / "two")
+    )
+    assert first == second
+
+
+def test_an_older_report_is_replaced_whole(home: Path) -> None:
+    made_grid(home / "runs", seeds=1, levels=1)
+    other = made_run(home / "runs", "my-data-v0", "td3_bc", "default", 0, 50)
+    offbench.report(home / "runs", home / "out")
+    (home / "out" / "notes.txt").write_text("mine")
+    assert (home / "out" / "figures" / "curves-my-data-v0.png").exists()
+    shutil.rmtree(other.folder)
+    offbench.report(home / "runs", home / "out")
+    offbench.report(home / "runs", home / "fresh")
+    names = [{str(p.relative_to(home / out)) for p in (home / out).rglob("*")} for out in ("out", "fresh")]
+    assert names[0] - names[1] == {"notes.txt"}
+    assert names[1] <= names[0]
+
+
+def test_another_page_is_not_replaced(home: Path) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    (home / "out").mkdir()
+    (home / "out" / "index.html").write_text("my home page")
+    with pytest.raises(offbench.OffbenchError, match="is not a report of offbench"):
+        offbench.report(home / "runs", home / "out")
+    assert (home / "out" / "index.html").read_text() == "my home page"
+
+
+def test_a_shipped_dataset_card_is_shown(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = Path(str(importlib.resources.files("offbench")))
+    shutil.copytree(package / "assets", home / "package" / "assets")
+    shutil.copytree(package / "published", home / "package" / "published")
+    values = {"transitions": 1000, "episodes": 7, "return": 12.3, "std": 4.5, "score": 33.3, "terminated": 0.25}
+    card = {"versions": {"mujoco": "3.4.0"}, "levels": {"medium": values | {"content_sha256": "0123456789abcdef"}}}
+    write_json(home / "package" / "datasets" / "hopper" / "card.json", card)
+    (home / "package" / "datasets" / "hopper" / "card.png").write_bytes(b"\x89PNG")
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    made_run(home / "runs", "my-medium-v0", "td3_bc", "default", 0, 50)
+    monkeypatch.setattr(reporting.importlib.resources, "files", lambda _: home / "package")
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert "hopper (mujoco 3.4.0)" in page.text
+    assert "25.0%" in page.text
+    pictures = [a for name, a in page.elements if name == "img"]
+    assert len(pictures) == 1
+    assert (pictures[0]["src"] or "").startswith("data:image/png;base64,")
+    assert "hopper" in (pictures[0]["alt"] or "")

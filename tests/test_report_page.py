@@ -1,0 +1,61 @@
+"""The page fetches nothing, runs nothing but its own script, and can be used without eyes."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import offbench
+from offbench.report_figures import shortened
+from tests.made_runs import METHODS, made_grid
+from tests.pages import HOSTILE, Page, hostile_runs
+
+
+def test_names_that_are_markup_stay_text(home: Path) -> None:
+    hostile_runs(home / "runs")
+    path = offbench.report(home / "runs", home / "out")
+    page = Page(path)
+    names = [name for name, _ in page.elements]
+    assert names.count("script") == 1
+    assert names.count("style") == 1
+    assert "img" not in names
+    assert not [key for _, attributes in page.elements for key in attributes if key.startswith("on")]
+    assert HOSTILE in page.text.replace("\xa0", " ")
+    outside = re.sub(r"<script>.*?</script>", "", path.read_text(), flags=re.DOTALL)
+    assert "hacked=1" in outside  # as text
+    assert "<img" not in (home / "out" / "tables" / "scores.md").read_text()
+    latex = (home / "out" / "tables" / "scores.tex").read_text()
+    assert all(line.startswith(("%", "\\")) or line.endswith(r" \\") for line in latex.splitlines())
+    assert "<script" not in latex.replace("% ", "")
+
+
+def test_long_names_are_shortened_in_pictures() -> None:
+    assert shortened("td3_bc", 8) == "td3_bc"
+    assert shortened("abcdefghijkl", 8) == "abcd…jkl"
+    assert len(shortened("x" * 99, 24)) == 24
+
+
+def test_nothing_is_fetched(home: Path) -> None:
+    made_grid(home / "runs", seeds=2, levels=1)
+    page = Page(offbench.report(home / "runs", home / "out"))
+    for name, attributes in page.elements:
+        for key in ("src", "srcset", "data", "action", "poster", "xlink:href"):
+            value = attributes.get(key) or "#"
+            assert value.startswith(("#", "data:")), (name, key, value)
+        assert name not in ("link", "iframe", "object", "embed", "base", "form")
+    policies = [a["content"] or "" for name, a in page.elements if a.get("http-equiv") == "Content-Security-Policy"]
+    assert len(policies) == 1
+    assert "default-src 'none'" in policies[0]
+    assert "unsafe-inline'; script" not in policies[0].replace("style-src 'unsafe-inline'; img", "")
+
+
+def test_tables_are_accessible(home: Path) -> None:
+    made_grid(home / "runs", seeds=2, levels=1)
+    page = Page(offbench.report(home / "runs", home / "out"))
+    count = {name: sum(n == name for n, _ in page.elements) for name in ("table", "caption", "th")}
+    assert count["table"] == count["caption"] + len(METHODS)  # boxes name theirs by their heading
+    assert all(a.get("scope") in ("row", "col") for name, a in page.elements if name == "th")
+    pictures = [a for name, a in page.elements if a.get("role") == "img" and name == "div"]
+    assert pictures
+    assert all(len(a["aria-label"] or "") > 20 for a in pictures)
+    assert dict(page.elements)["html"]["lang"] == "en"

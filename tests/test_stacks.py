@@ -1,0 +1,147 @@
+"""Many runs of one command: over processes, to a deadline, with one that diverges."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import offbench
+from offbench import checkpoints
+from offbench.errors import OffbenchError
+from offbench.jobs import Job, Order, perform
+from offbench.runs import Run
+from offbench.stacking import cut, pending
+from offbench.training import Schedule
+
+SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32}
+TIMES: dict[str, Any] = {"eval_every": 100, "eval_episodes": 2}
+
+
+def orders(dataset: str, runs: str, seeds: int, algorithm: str = "bdb", **settings: Any) -> list[Order]:
+    known = {"hidden": [16, 16], "batch_size": 32} | settings
+    name = "-".join(f"{key}={value}" for key, value in settings.items())
+    return [Order(algorithm, dataset, known, seed, f"{runs}/{algorithm}{name}/{seed}") for seed in range(seeds)]
+
+
+def jobs_of(orders: list[Order], schedule: Schedule, processes: int, stack: int | str = "auto") -> list[Job]:
+    return [job for part in cut(orders, "cpu", processes, stack) for job in pending(part, schedule)]
+
+
+def finish(jobs: list[Job]) -> None:
+    for job in jobs:
+        assert perform(job, lambda step, note: None) == []
+
+
+@pytest.mark.slow
+def test_two_processes_train_what_one_does(medium: str) -> None:
+    """Stacks of one run each, so that the sums in a matrix product are the same: the bits must be too."""
+    one = offbench.train("bdb", medium, steps=200, runs="one", seeds=[0, 1, 2], workers=1, stack=1, **SMALL, **TIMES)
+    two = offbench.train("bdb", medium, steps=200, runs="two", seeds=[0, 1, 2], workers=2, stack=1, **SMALL, **TIMES)
+    for a, b in zip(map(Run, one), map(Run, two), strict=True):
+        assert a.policy_path.read_bytes() == b.policy_path.read_bytes()
+        assert a.evaluations_path.read_bytes() == b.evaluations_path.read_bytes()
+
+
+def test_stacks_are_cut_for_the_processes_and_by_size(medium: str) -> None:
+    schedule = Schedule(100, 100, 2, "cpu", 0)
+
+    def sizes(count: int, processes: int, stack: int | str = "auto") -> list[int]:
+        jobs = jobs_of(orders(medium, "runs", count), schedule, processes, stack=stack)
+        return [len(job.orders) for job in jobs]
+
+    assert sizes(5, 1) == [5]
+    assert sizes(5, 2) == [3, 2]
+    assert sizes(1, 8) == [1]
+    assert sizes(20, 1) == [7, 7, 6]  # at most 8 of them in one process
+    assert sizes(20, 2) == [5, 5, 5, 5]  # three stacks would leave a process idle at the end
+    assert sizes(4, 1, stack=3) == [2, 2]
+    with pytest.raises(OffbenchError, match="stack must be auto or a whole number"):
+        sizes(4, 1, stack=0)
+
+
+def test_what_cannot_differ_within_a_stack_makes_stacks_of_its_own(medium: str) -> None:
+    schedule = Schedule(100, 100, 2, "cpu", 0)
+    mixed = orders(medium, "runs", 2, beta=0.5) + orders(medium, "runs", 1, beta="adaptive")
+    mixed += orders(medium, "runs", 2, critics=3) + orders(medium, "runs", 1, algorithm="td3_bc")
+    assert [len(job.orders) for job in jobs_of(mixed, schedule, 1)] == [3, 2, 1]
+
+
+def test_another_environment_makes_a_stack_of_its_own(medium: str, home: Path) -> None:
+    """The same shapes, another time limit: evaluations and references must not be mixed up."""
+    shutil.copytree(home / "minari" / medium, home / "minari" / "longer-v0")
+    path = home / "minari" / "longer-v0" / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    spec = json.loads(metadata["eval_env_spec"]) | {"max_episode_steps": 500}
+    path.write_text(json.dumps(metadata | {"eval_env_spec": json.dumps(spec), "dataset_id": "longer-v0"}))
+    both = orders(medium, "runs", 2) + orders("longer-v0", "longer", 1)
+    jobs = jobs_of(both, Schedule(100, 100, 2, "cpu", 0), 1)
+    assert [{order.dataset for order in job.orders} for job in jobs] == [{medium}, {"longer-v0"}]
+
+
+def test_a_stack_that_goes_on_has_the_same_runs_as_before(medium: str) -> None:
+    """Of two stacks of two, one is done: the other is not cut anew to fill the processes."""
+    schedule = Schedule(200, 100, 2, "cpu", 0)
+    finish(jobs_of(orders(medium, "runs", 4), schedule, 2)[:1])
+    (job,) = jobs_of(orders(medium, "runs", 4), schedule, 2)
+    assert [order.seed for order in job.orders] == [2, 3]
+
+
+def test_a_deadline_leaves_a_checkpoint_that_goes_on_to_the_same_end(medium: str) -> None:
+    schedule = Schedule(1000, 500, 2, "cpu", 0)
+    finish(jobs_of(orders(medium, "whole", 2), schedule, 1))
+    (job,) = jobs_of(orders(medium, "runs", 2), schedule, 1)
+    perform(replace(job, schedule=replace(schedule, deadline=time.time())), lambda step, note: None)
+    folder = Path(job.orders[0].folder)
+    assert checkpoints.steps(folder) == [100]  # the first chunk was done when it looked at the clock
+    finish(jobs_of(orders(medium, "runs", 2), schedule, 1))
+    for a, b in zip(orders(medium, "whole", 2), orders(medium, "runs", 2), strict=True):
+        ours, theirs = Run(Path(a.folder)), Run(Path(b.folder))
+        assert ours.policy_path.read_bytes() == theirs.policy_path.read_bytes()
+        assert ours.evaluations() == theirs.evaluations()
+
+
+def test_a_run_that_diverges_is_marked_and_the_others_go_on(medium: str) -> None:
+    common: dict[str, Any] = {"runs": "runs", "seeds": [0, 1], "workers": 1, **SMALL, **TIMES}
+    calm = offbench.train("td3_bc", medium, steps=300, **common | {"runs": "calm"})
+    bad, good = offbench.train("td3_bc", medium, steps=100, **common)
+    newest = bad / "checkpoint-000000100.safetensors"
+    tensors = load_file(newest)
+    tensors["critic.flat"] *= 1e30  # as a run that is about to overflow
+    save_file(tensors, newest, metadata={"offbench": '{"step": 100}'})
+    with pytest.raises(OffbenchError, match=r"seed-0: critic.*became NaN or infinite by step 200"):
+        offbench.train("td3_bc", medium, steps=300, **common)
+    assert checkpoints.steps(bad) == [100]
+    assert Run(bad).evaluations().keys() == {100}
+    ours, theirs = (load_file(run / "checkpoint-000000300.safetensors") for run in (calm[1], good))
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    with pytest.raises(OffbenchError, match="seed-0 has diverged before and is left as it is"):
+        offbench.train("td3_bc", medium, steps=300, **common)
+
+
+def test_td3_bc_as_a_guest_in_a_stack_of_bdb_is_td3_bc(medium: str) -> None:
+    """On a GPU the two train as one program. Started as a guest, gone on with alone: the same bits all the way."""
+    schedule = Schedule(200, 100, 2, "cpu", 0)
+    td3_bc, bdb = (orders(medium, "together", 1, algorithm=name)[0] for name in ("td3_bc", "bdb"))
+    own = [td3_bc.member(kind=kind) for kind in ("td3_bc", "bdb")]
+    assert [type(member.config).__module__ for member in own] == ["offbench.algos.td3_bc", "offbench.algos.bdb"]
+    (part,) = cut([replace(td3_bc, seed=3)], "cpu", 1)
+    assert part.kind == "td3_bc"  # on a CPU a guest would only cost more
+    pending(part, schedule)  # claims the run
+    finish([Job("bdb", (replace(td3_bc, seed=3),), replace(schedule, steps=100))])
+    finish([Job("td3_bc", (replace(td3_bc, seed=3),), schedule)])
+    alone = replace(orders(medium, "alone", 1, algorithm="td3_bc")[0], seed=3)
+    finish([Job("td3_bc", (alone,), schedule)])
+    finish([Job("bdb", (replace(td3_bc, seed=3),), replace(schedule, steps=300))])  # and back again
+    finish([Job("td3_bc", (alone,), replace(schedule, steps=300))])
+    ours, theirs = (load_file(Path(o.folder) / "checkpoint-000000300.safetensors") for o in (td3_bc, alone))
+    assert theirs.keys() < ours.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    assert bdb.host is None
