@@ -7,8 +7,10 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from json import dumps
-from typing import Any, NoReturn
+from typing import Any
 
+from offbench import travel
+from offbench.arguments import Parser, auto, natural, number, seed_list, share, whole
 from offbench.errors import OffbenchError, unknown
 
 COMMANDS = {
@@ -29,14 +31,6 @@ COMMANDS = {
     "card": "write an environment's dataset card from its five recorded levels",
 }
 SWITCHES = ("--tf32", "--tensorboard")  # flags of `train` without a value: the algorithm may follow them
-
-
-class Parser(argparse.ArgumentParser):
-    """An argument parser whose refusals are one line and exit code 2."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise the refusal as the error that `main` prints."""
-        raise OffbenchError(f"{message} (see `{self.prog} --help`)")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -326,65 +320,6 @@ def _show(parser: Parser, _: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
-def _verify(parser: Parser, _: list[str]) -> None:
-    parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset, anybody's")
-    parser.add_argument("--episodes", type=natural, help="to play again (default: 300; 0: none)")
-    parser.add_argument("--workers", type=whole, help="processes (default: one a core)")
-    parser.add_argument("--json", action="store_true", dest="as_json", help="print the report as JSON")
-
-    def run(as_json: bool, **arguments: Any) -> None:
-        from offbench.verification import verify
-
-        report = verify(**arguments)
-        print(report.to_json() if as_json else "\n".join(report.lines()))
-        if not report.ok:
-            sys.exit(1)
-
-    parser.set_defaults(run=run)
-
-
-def _import(parser: Parser, _: list[str]) -> None:
-    parser.add_argument("file", metavar="FILE.hdf5", help="a D4RL file, or one that `offbench export` wrote")
-    parser.add_argument("--id", dest="dataset_id", required=True, help="the Minari id, e.g. d4rl-hopper-medium-v2")
-    parser.add_argument("--env", metavar="RECIPE", help="the environment to evaluate in (default: by the file's name)")
-    parser.add_argument("--overwrite", action="store_true", help="replace a dataset of that id")
-
-    def run(**arguments: Any) -> None:
-        from offbench.d4rl import import_d4rl
-
-        print(f"{import_d4rl(**arguments)} imported; next: offbench show {arguments['dataset_id']}")
-
-    parser.set_defaults(run=run)
-
-
-def _export(parser: Parser, _: list[str]) -> None:
-    parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset")
-    parser.add_argument("--out", required=True, metavar="FILE", help="the file to write")
-    parser.add_argument("--format", choices=("d4rl", "npz"), default="d4rl", dest="style", help="default: d4rl")
-    parser.add_argument(
-        "--drop-timeouts", action="store_true", help="npz: without the steps that D4RL's qlearning_dataset drops"
-    )
-
-    def run(**arguments: Any) -> None:
-        from offbench.exports import export
-
-        print(f"written to {export(**arguments)}")
-
-    parser.set_defaults(run=run)
-
-
-def _export_policy(parser: Parser, _: list[str]) -> None:
-    parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run directory or a policy file")
-    parser.add_argument("--out", required=True, metavar="FILE.pt", help="the file to write")
-
-    def run(**arguments: Any) -> None:
-        from offbench.deploy import export_policy
-
-        print(f"written to {export_policy(**arguments)}")
-
-    parser.set_defaults(run=run)
-
-
 def _card(parser: Parser, _: list[str]) -> None:
     parser.add_argument("env", metavar="ENV", help="a recipe with a ladder in the folder `behaviour` beside it")
     parser.add_argument("--out", metavar="DIR", help="where the card goes (default: <env>-card)")
@@ -408,61 +343,9 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "behaviour": _behaviour,
     "list": _list,
     "show": _show,
-    "verify": _verify,
-    "import-d4rl": _import,
-    "export": _export,
-    "export-policy": _export_policy,
+    "verify": travel.verify_arguments,
+    "import-d4rl": travel.import_arguments,
+    "export": travel.export_arguments,
+    "export-policy": travel.export_policy_arguments,
     "card": _card,
 }
-
-
-def whole(text: str) -> int:
-    """Return a whole number from 1 (1e6 and 1_000_000 are understood)."""
-    return _whole(text, 1)
-
-
-def auto(text: str) -> int | str:
-    """Return "auto" or a whole number from 1."""
-    return text if text == "auto" else whole(text)
-
-
-def natural(text: str) -> int:
-    """Return a whole number from 0."""
-    return _whole(text, 0)
-
-
-def _whole(text: str, least: int) -> int:
-    try:
-        value = float(text)
-        if value != int(value) or value < least:
-            raise ValueError
-    except (ValueError, OverflowError):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}") from None
-    return int(value)
-
-
-def share(text: str) -> tuple[int, int]:
-    """Return (i, n) of `i/n`."""
-    first, slash, last = text.partition("/")
-    if not slash:
-        raise argparse.ArgumentTypeError(f"{text!r} is no share like 0/4")
-    return natural(first), whole(last)
-
-
-def number(text: str) -> float:
-    """Return a number."""
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
-
-
-def seed_list(text: str) -> list[int]:
-    """Return the seeds of `3`, `0,1,2` or `0:5` (the end is left out, as in Python)."""
-    first, colon, last = text.partition(":")
-    if colon:
-        found = list(range(natural(first), natural(last)))
-        if not found:
-            raise argparse.ArgumentTypeError(f"{text!r} holds no seed")
-        return found
-    return [natural(part) for part in text.split(",")]

@@ -139,10 +139,7 @@ class Run:
             return []
         try:
             with open(path, newline="", encoding="utf-8") as file:
-                rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
-            if not all("step" in row for row in rows):
-                raise ValueError("a row has no step")
-            return rows
+                return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
         except (OSError, ValueError, TypeError, csv.Error) as error:
             raise OffbenchError(f"{path} is damaged: {error}; delete the run to repeat it") from None
 

@@ -8,6 +8,7 @@ a run that diverges:     is left out from there on and marked; the others go on,
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
@@ -154,7 +155,7 @@ class Trainer:
             known, rows = member.run.evaluations(), member.run.losses()
             # an evaluation at the end of a shorter schedule may lie off this one's grid
             self.evaluations[run] = {s: e for s, e in known.items() if s <= self.stack.step and self._evaluates_at(s)}
-            self.losses[run] = [row for row in rows if row["step"] <= self.stack.step]
+            self.losses[run] = [row for row in rows if row.get("step", math.inf) <= self.stack.step]
 
     def _checkpoint(self) -> None:
         """Write everything up to now."""

@@ -29,7 +29,6 @@ from offbench.d4rl import import_d4rl
 from offbench.describe import Summary
 from offbench.errors import OffbenchError
 from offbench.ladder import read_ladder
-from offbench.launch import references
 from offbench.policy import Policy, load_policy
 from offbench.provenance import warn_other_physics
 from offbench.recipes import read_recipe, shipped
@@ -195,7 +194,7 @@ def metadata(folder: Path, data: bytes) -> object:
     flat = Transitions(**empty | {"dataset_id": "fuzzed-v0", "metadata": found})
     warn_other_physics("fuzzed-v0", dataset.provenance(found).get("versions", {}))
     summary = Summary("fuzzed-v0", found, np.arange(4.0), np.arange(1, 5), 0.5)
-    return flat.env_id, references(flat), summary.lines()
+    return flat.env_id, flat.references, summary.lines()
 
 
 def ladder(folder: Path, data: bytes) -> object:
@@ -240,7 +239,7 @@ def evaluations(folder: Path, data: bytes) -> object:
 
 
 def losses(folder: Path, data: bytes) -> object:
-    return [row["step"] for row in run_folder(folder, losses=data).losses()]
+    return [row.get("step") for row in run_folder(folder, losses=data).losses()]
 
 
 def _csv(header: list[str], rows: list[list[Any]]) -> bytes:
