@@ -7,8 +7,10 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from json import dumps
-from typing import Any, NoReturn
+from typing import Any
 
+from offbench import travel
+from offbench.arguments import Parser, auto, natural, number, seed_list, share, whole
 from offbench.errors import OffbenchError, unknown
 
 COMMANDS = {
@@ -22,21 +24,20 @@ COMMANDS = {
     "behaviour": "train an environment's behaviour agent (SAC) and build its ladder",
     "list": "environments, levels, algorithms and local datasets",
     "show": "what is in a dataset",
+    "verify": "check a dataset: its arrays, its metadata, and a sample of episodes played again",
+    "import-d4rl": "turn a D4RL file (v0, v1, v2) into a Minari dataset",
+    "export": "write a dataset as a D4RL file, or as arrays (npz)",
+    "export-policy": "write a run's policy as TorchScript",
     "card": "write an environment's dataset card from its five recorded levels",
 }
 SWITCHES = ("--tf32", "--tensorboard")  # flags of `train` without a value: the algorithm may follow them
 
 
-class Parser(argparse.ArgumentParser):
-    """An argument parser whose refusals are one line and exit code 2."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise the refusal as the error that `main` prints."""
-        raise OffbenchError(f"{message} (see `{self.prog} --help`)")
-
-
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run one command; exit with 0, with 2 for a problem the user can mend, with 130 after Ctrl-C."""
+    """Run one command.
+
+    Exits with 0, 1 if `verify` found something, 2 for a problem the user can mend, 130 after Ctrl-C.
+    """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         _run(words)
@@ -342,57 +343,9 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "behaviour": _behaviour,
     "list": _list,
     "show": _show,
+    "verify": travel.verify_arguments,
+    "import-d4rl": travel.import_arguments,
+    "export": travel.export_arguments,
+    "export-policy": travel.export_policy_arguments,
     "card": _card,
 }
-
-
-def whole(text: str) -> int:
-    """Return a whole number from 1 (1e6 and 1_000_000 are understood)."""
-    return _whole(text, 1)
-
-
-def auto(text: str) -> int | str:
-    """Return "auto" or a whole number from 1."""
-    return text if text == "auto" else whole(text)
-
-
-def natural(text: str) -> int:
-    """Return a whole number from 0."""
-    return _whole(text, 0)
-
-
-def _whole(text: str, least: int) -> int:
-    try:
-        value = float(text)
-        if value != int(value) or value < least:
-            raise ValueError
-    except (ValueError, OverflowError):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}") from None
-    return int(value)
-
-
-def share(text: str) -> tuple[int, int]:
-    """Return (i, n) of `i/n`."""
-    first, slash, last = text.partition("/")
-    if not slash:
-        raise argparse.ArgumentTypeError(f"{text!r} is no share like 0/4")
-    return natural(first), whole(last)
-
-
-def number(text: str) -> float:
-    """Return a number."""
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
-
-
-def seed_list(text: str) -> list[int]:
-    """Return the seeds of `3`, `0,1,2` or `0:5` (the end is left out, as in Python)."""
-    first, colon, last = text.partition(":")
-    if colon:
-        found = list(range(natural(first), natural(last)))
-        if not found:
-            raise argparse.ArgumentTypeError(f"{text!r} holds no seed")
-        return found
-    return [natural(part) for part in text.split(",")]
