@@ -311,7 +311,8 @@ def _write(
         shutil.rmtree(aside, ignore_errors=True)
         (aside / "policies").mkdir(parents=True)
         for step in roles:
-            shutil.copyfile(training.policy(step), aside / "policies" / training.policy(step).name)
+            # written anew: a policy of an older offbench has no hash of its own yet
+            load_policy(training.policy(step)).save(aside / "policies" / training.policy(step).name)
         write_bytes(aside / "ladder.csv", csv_bytes(COLUMNS, _table(training, rows, surveyor, roles)))
         info["medium_replay"] = save_replay(
             aside / "medium-replay.hdf5", replay_episodes(training, info["levels"]["medium"])
