@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from offbench.exports import export
     from offbench.launch import train
     from offbench.record import collect
-    from offbench.reporting import report
+    from offbench.reports import report
     from offbench.tables import normalize_runs_or_returns as normalize
     from offbench.transitions import load
     from offbench.verification import verify
@@ -64,7 +64,7 @@ _VERBS = {
     "inventory": ("offbench.describe", "inventory"),
     "load": ("offbench.transitions", "load"),
     "normalize": ("offbench.tables", "normalize_runs_or_returns"),
-    "report": ("offbench.reporting", "report"),
+    "report": ("offbench.reports", "report"),
     "show": ("offbench.describe", "show"),
     "train": ("offbench.launch", "train"),
     "verify": ("offbench.verification", "verify"),

@@ -274,7 +274,7 @@ def _report(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--out", default="report", metavar="DIR", help="where the report goes (default: report)")
 
     def run(**arguments: Any) -> None:
-        from offbench.reporting import report
+        from offbench.reports import report
 
         print(f"report in {report(**arguments)}")
 
