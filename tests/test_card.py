@@ -43,7 +43,7 @@ def test_levels_are_in_order(name: str) -> None:
 def test_the_readme_says_what_the_card_says(name: str) -> None:
     text, known = (shipped(name) / "README.md").read_text(), read_json(shipped(name) / "card.json")
     for level, facts in known["levels"].items():
-        assert f"| {level} | {facts['transitions']:,} | {facts['episodes']:,} | {facts["return"]:,.1f} |" in text
+        assert f"| {level} | {facts['transitions']:,} | {facts['episodes']:,} | {facts['return']:,.1f} |" in text
         assert facts["content_sha256"] in text
     assert (shipped(name) / "card.png").stat().st_size < 300_000
 
