@@ -17,6 +17,8 @@ from filelock import FileLock, Timeout
 
 from offbench.errors import OffbenchError
 
+ORPHANS = 3.0  # seconds to wait for a lock: processes whose parent was killed notice it within one
+
 
 @contextlib.contextmanager
 def disk_errors(what: str) -> Iterator[None]:
@@ -45,7 +47,7 @@ def sole(lock: Path, what: str) -> Iterator[None]:
     with disk_errors(str(lock.parent)):
         lock.parent.mkdir(parents=True, exist_ok=True)
         try:
-            held.acquire(timeout=0)
+            held.acquire(timeout=ORPHANS)
         except Timeout:
             raise OffbenchError(f"{what} by {_holder(holder)}; wait for it, or stop it") from None
     try:
