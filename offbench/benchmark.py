@@ -21,7 +21,7 @@ from offbench.calibrate import Rate, measure, step_seconds
 from offbench.devices import pick_device
 from offbench.errors import OffbenchError
 from offbench.grid import Entry, Grid, Source, Times, load_grid
-from offbench.jobs import Job, Order, run_jobs
+from offbench.jobs import Job, Order, complain, run_jobs
 from offbench.launch import configurations
 from offbench.levels import parse_level
 from offbench.progress import duration
@@ -29,7 +29,7 @@ from offbench.recipes import Recipe, load_recipe
 from offbench.record import record_source
 from offbench.registry import load_algorithm
 from offbench.runs import run_folder, settings_dict, variant
-from offbench.stacking import Part, cut, pending, with_evaluators
+from offbench.stacking import Part, cut, diverged, pending, with_evaluators
 from offbench.training import Schedule
 from offbench.workers import default_workers
 
@@ -165,10 +165,9 @@ def benchmark(
     ]
     if bench.device != "cpu":
         jobs = with_evaluators(jobs, bench.workers)
-    problems = executor.train(jobs, bench.processes) if jobs else []
-    if problems:
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise OffbenchError(problems[0] + more)
+    for line in diverged([part for part, _ in parts]):  # known since an earlier call, which failed for it
+        say(line)
+    complain(executor.train(jobs, bench.processes) if jobs else [])
     return not any(pending(part, schedule, tf32=tf32, command=command) for part, schedule in parts)
 
 
@@ -194,8 +193,7 @@ def prepare(
 
 def _configs(entry: Entry) -> list[Any]:
     kind = load_algorithm(entry.algorithm)
-    found = configurations(kind.Config, entry.settings, entry.algorithm)
-    return list(dict.fromkeys(kind.Config(**values) for values in found))
+    return configurations(kind.Config, entry.settings, entry.algorithm)
 
 
 def _seconds(text: str) -> float:

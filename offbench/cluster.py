@@ -34,7 +34,7 @@ SLICE = 600.0  # seconds that a task trains before it hands back
 RETRIES = 5  # times that Ray runs a lost task again
 REACH = 5.0  # seconds to wait for a cluster
 LOOK = 1.0  # seconds between two looks at the tasks
-LEFT_OUT = (".lock", ".tmp")  # endings of files that mean something to one process alone
+LEFT_OUT = (".lock", ".holder", ".tmp")  # endings of files that mean something to one process alone
 
 Files = dict[str, bytes]
 

@@ -135,7 +135,7 @@ def _space(metadata: dict[str, Any], key: str) -> str:
     try:
         space = json.loads(metadata[key])
         return f"{space['type']} {tuple(space['shape'])} {space['dtype']}"
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, RecursionError):
         return "unknown"
 
 

@@ -119,6 +119,13 @@ def run_jobs(jobs: Sequence[Job], processes: int) -> list[str]:
             return list(_spread(jobs, processes, pool, board))
 
 
+def complain(problems: Sequence[str]) -> None:
+    """Raise OffbenchError for the first of several problems, saying how many more there are; none is none."""
+    if problems:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise OffbenchError(problems[0] + more)
+
+
 class Board(contextlib.AbstractContextManager["Board"]):
     """Adds up the jobs' steps for one progress bar."""
 

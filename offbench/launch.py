@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import operator
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,13 @@ from offbench import checkpoints, transitions
 from offbench.batches import Member
 from offbench.devices import pick_device
 from offbench.errors import OffbenchError, unknown
-from offbench.jobs import Order, run_jobs
+from offbench.jobs import Order, complain, run_jobs
 from offbench.loggers import Destinations
 from offbench.registry import load_algorithm
 from offbench.runs import Run, run_folder, settings_dict, variant
 from offbench.settings import build, check, fields
 from offbench.stack import Stack
-from offbench.stacking import cut, pending, with_evaluators
+from offbench.stacking import cut, diverged, pending, with_evaluators
 from offbench.training import Schedule
 from offbench.workers import cores, default_workers
 
@@ -68,7 +68,7 @@ def train(
         OffbenchError: anything that the user can mend, said in one line.
     """
     kind = load_algorithm(algorithm)
-    configs = list(dict.fromkeys(kind.Config(**values) for values in configurations(kind.Config, settings, algorithm)))
+    configs = configurations(kind.Config, settings, algorithm)
     seed_list = _seed_list(seeds)
     _check_numbers(seed_list, steps, eval_every, eval_episodes)
     names = [dataset] if isinstance(dataset, str) else list(dict.fromkeys(dataset))
@@ -95,15 +95,7 @@ def train(
         jobs = with_evaluators(jobs, default_workers(workers))
     elif len(jobs) == 1:
         jobs = with_evaluators(jobs, max(1, cores() - 1) if workers is None else workers)
-    problems = [
-        f"{order.folder} has diverged before and is left as it is; delete it to try again"
-        for order in orders
-        if Run(Path(order.folder)).diverged
-    ]
-    problems += run_jobs(jobs, processes) if jobs else []
-    if problems:
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise OffbenchError(problems[0] + more)
+    complain(diverged(parts) + (run_jobs(jobs, processes) if jobs else []))
     return [Path(order.folder) for order in orders]
 
 
@@ -114,8 +106,8 @@ def _seed_list(seeds: int | Sequence[int]) -> list[int]:
         raise OffbenchError(f"seeds must be whole numbers, not {seeds!r}") from None
 
 
-def configurations(cls: type, settings: Mapping[str, Any], algorithm: str) -> Iterator[dict[str, Any]]:
-    """Yield the settings of each config: the product of all lists given."""
+def configurations(cls: type, settings: Mapping[str, Any], algorithm: str) -> list[Any]:
+    """Return the different configs of the product of all lists given. Raises OffbenchError for a bad setting."""
     known, columns = fields(cls), []
     for name, value in settings.items():
         if name not in known:
@@ -125,8 +117,7 @@ def configurations(cls: type, settings: Mapping[str, Any], algorithm: str) -> It
         if not values:
             raise OffbenchError(f"{algorithm}: {name} got an empty list")
         columns.append([(name, check(cls, name, item, algorithm)) for item in values])
-    for row in itertools.product(*columns):
-        yield dict(row)
+    return list(dict.fromkeys(cls(**dict(row)) for row in itertools.product(*columns)))
 
 
 def _check_numbers(seeds: Sequence[int], steps: int, eval_every: int, eval_episodes: int) -> None:

@@ -108,6 +108,16 @@ def pending(part: Part, schedule: Schedule, *, tf32: bool = False, command: str 
     return [Job(part.kind, tuple(order_of[m.run.folder] for m in stage), schedule, tf32) for stage in stages]
 
 
+def diverged(parts: Sequence[Part]) -> list[str]:
+    """Return a line for each run that diverged in an earlier try; `pending` leaves them out."""
+    return [
+        f"{member.run.folder} has diverged before and is left as it is; delete it to try again"
+        for part in parts
+        for member in part.members
+        if member.run.diverged
+    ]
+
+
 def with_evaluators(jobs: Sequence[Job], workers: int) -> list[Job]:
     """Give each job evaluation processes of its own."""
     return [

@@ -79,7 +79,7 @@ def _limit(spec: str | None) -> int | None:
     """Return the time limit that an EnvSpec (JSON) names, if it does."""
     try:
         limit = json.loads(spec or "null")["max_episode_steps"]
-    except (TypeError, KeyError, ValueError):
+    except (TypeError, KeyError, ValueError, RecursionError):
         return None
     return limit if isinstance(limit, int) and limit > 0 else None
 

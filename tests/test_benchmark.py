@@ -230,3 +230,14 @@ def test_smoke_survives_five_kill_9(home: Path, monkeypatch: pytest.MonkeyPatch)
                 kills += 1
                 time.sleep(1.5)  # its workers notice within a second that it is gone
         assert json.dumps(table("killed")) == json.dumps(undisturbed)
+
+
+def test_a_run_that_diverged_before_is_said_and_left_alone(grid: str, home: Path) -> None:
+    assert benchmark.benchmark(grid, workers=1, say=silent)
+    run = find_runs(home / "runs")[0]
+    run.mark_diverged(100, "critic.flat")
+    said: list[str] = []
+    assert benchmark.benchmark(grid, workers=1, say=said.append)
+    assert (
+        said[-1] == f"{run.folder.relative_to(home)} has diverged before and is left as it is; delete it to try again"
+    )
