@@ -7,8 +7,9 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from json import dumps
-from typing import Any, NoReturn
+from typing import Any
 
+from offbench.arguments import Parser, auto, natural, number, seed_list, share, whole
 from offbench.errors import OffbenchError, unknown
 
 COMMANDS = {
@@ -23,16 +24,11 @@ COMMANDS = {
     "list": "environments, levels, algorithms and local datasets",
     "show": "what is in a dataset",
     "card": "write an environment's dataset card from its five recorded levels",
+    "video": "film a run's policy, a policy file, or a level such as hopper:medium",
+    "doctor": "what a bug report needs: versions, physics, machine, paths; exit code 1 if something is broken",
+    "completion": "print a shell's completion of these commands",
 }
 SWITCHES = ("--tf32", "--tensorboard")  # flags of `train` without a value: the algorithm may follow them
-
-
-class Parser(argparse.ArgumentParser):
-    """An argument parser whose refusals are one line and exit code 2."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise the refusal as the error that `main` prints."""
-        raise OffbenchError(f"{message} (see `{self.prog} --help`)")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -331,6 +327,53 @@ def _card(parser: Parser, _: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
+def _video(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run, a policy file, or ENV:LEVEL (hopper:medium)")
+    parser.add_argument("--out", default="video.mp4", metavar="FILE", help=".mp4 or .gif (default: video.mp4)")
+    parser.add_argument("--env", help="a recipe, instead of the environment the policy names")
+    parser.add_argument("--episodes", type=whole, default=1, help="default: 1")
+    parser.add_argument("--seconds", type=number, help="length of an episode at most (default: whole)")
+    parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
+    parser.add_argument("--fps", type=whole, default=25, help="frames a second (default: 25)")
+    parser.add_argument("--size", type=whole, default=480, help="longer side in pixels (default: 480)")
+
+    def run(**arguments: Any) -> None:
+        from offbench.video import video
+
+        print(f"film in {video(**arguments)}")
+
+    parser.set_defaults(run=run)
+
+
+def _doctor(parser: Parser, _: list[str]) -> None:
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+    def run(json: bool) -> None:
+        from offbench.doctor import BROKEN, as_json, doctor
+
+        found = doctor()
+        print(dumps(as_json(found), indent=1) if json else "\n".join(map(str, found)))
+        sys.exit(any(finding.state == BROKEN for finding in found))
+
+    parser.set_defaults(run=run)
+
+
+def _completion(parser: Parser, _: list[str]) -> None:
+    from offbench.completion import SHELLS, script
+
+    parser.add_argument("shell", choices=SHELLS)
+
+    def fill(words: list[str]) -> Parser:
+        sub = Parser(prog="offbench")
+        ADD[words[0]](sub, words[1:])
+        return sub
+
+    def run(shell: str) -> None:
+        print(script(shell, COMMANDS, fill))
+
+    parser.set_defaults(run=run)
+
+
 ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "collect": _collect,
     "train": _train,
@@ -343,56 +386,7 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "list": _list,
     "show": _show,
     "card": _card,
+    "video": _video,
+    "doctor": _doctor,
+    "completion": _completion,
 }
-
-
-def whole(text: str) -> int:
-    """Return a whole number from 1 (1e6 and 1_000_000 are understood)."""
-    return _whole(text, 1)
-
-
-def auto(text: str) -> int | str:
-    """Return "auto" or a whole number from 1."""
-    return text if text == "auto" else whole(text)
-
-
-def natural(text: str) -> int:
-    """Return a whole number from 0."""
-    return _whole(text, 0)
-
-
-def _whole(text: str, least: int) -> int:
-    try:
-        value = float(text)
-        if value != int(value) or value < least:
-            raise ValueError
-    except (ValueError, OverflowError):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}") from None
-    return int(value)
-
-
-def share(text: str) -> tuple[int, int]:
-    """Return (i, n) of `i/n`."""
-    first, slash, last = text.partition("/")
-    if not slash:
-        raise argparse.ArgumentTypeError(f"{text!r} is no share like 0/4")
-    return natural(first), whole(last)
-
-
-def number(text: str) -> float:
-    """Return a number."""
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
-
-
-def seed_list(text: str) -> list[int]:
-    """Return the seeds of `3`, `0,1,2` or `0:5` (the end is left out, as in Python)."""
-    first, colon, last = text.partition(":")
-    if colon:
-        found = list(range(natural(first), natural(last)))
-        if not found:
-            raise argparse.ArgumentTypeError(f"{text!r} holds no seed")
-        return found
-    return [natural(part) for part in text.split(",")]

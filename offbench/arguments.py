@@ -1,0 +1,68 @@
+"""What the command line is parsed with: a parser whose refusals are one line, and the words it reads as values."""
+
+from __future__ import annotations
+
+import argparse
+from typing import NoReturn
+
+from offbench.errors import OffbenchError
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose refusals are one line and exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise the refusal as the error that `main` prints."""
+        raise OffbenchError(f"{message} (see `{self.prog} --help`)")
+
+
+def whole(text: str) -> int:
+    """Return a whole number from 1 (1e6 and 1_000_000 are understood)."""
+    return _whole(text, 1)
+
+
+def auto(text: str) -> int | str:
+    """Return "auto" or a whole number from 1."""
+    return text if text == "auto" else whole(text)
+
+
+def natural(text: str) -> int:
+    """Return a whole number from 0."""
+    return _whole(text, 0)
+
+
+def _whole(text: str, least: int) -> int:
+    try:
+        value = float(text)
+        if value != int(value) or value < least:
+            raise ValueError
+    except (ValueError, OverflowError):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}") from None
+    return int(value)
+
+
+def share(text: str) -> tuple[int, int]:
+    """Return (i, n) of `i/n`."""
+    first, slash, last = text.partition("/")
+    if not slash:
+        raise argparse.ArgumentTypeError(f"{text!r} is no share like 0/4")
+    return natural(first), whole(last)
+
+
+def number(text: str) -> float:
+    """Return a number."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
+def seed_list(text: str) -> list[int]:
+    """Return the seeds of `3`, `0,1,2` or `0:5` (the end is left out, as in Python)."""
+    first, colon, last = text.partition(":")
+    if colon:
+        found = list(range(natural(first), natural(last)))
+        if not found:
+            raise argparse.ArgumentTypeError(f"{text!r} holds no seed")
+        return found
+    return [natural(part) for part in text.split(",")]
