@@ -24,20 +24,17 @@ if TYPE_CHECKING:
     from offbench.assess import evaluate
     from offbench.comparison import compare
     from offbench.describe import inventory, show
-    from offbench.doctor import doctor
     from offbench.launch import train
     from offbench.record import collect
     from offbench.reporting import report
     from offbench.tables import normalize_runs_or_returns as normalize
     from offbench.transitions import load
-    from offbench.video import video
 
 __all__ = [
     "OffbenchError",
     "behaviour",
     "collect",
     "compare",
-    "doctor",
     "evaluate",
     "inventory",
     "load",
@@ -45,7 +42,6 @@ __all__ = [
     "report",
     "show",
     "train",
-    "video",
 ]
 
 # Loaded when first used: `offbench list` must not wait for PyTorch.
@@ -53,7 +49,6 @@ _VERBS = {
     "behaviour": ("offbench.agents", "behaviour"),
     "collect": ("offbench.record", "collect"),
     "compare": ("offbench.comparison", "compare"),
-    "doctor": ("offbench.doctor", "doctor"),
     "evaluate": ("offbench.assess", "evaluate"),
     "inventory": ("offbench.describe", "inventory"),
     "load": ("offbench.transitions", "load"),
@@ -61,7 +56,6 @@ _VERBS = {
     "report": ("offbench.reporting", "report"),
     "show": ("offbench.describe", "show"),
     "train": ("offbench.launch", "train"),
-    "video": ("offbench.video", "video"),
 }
 
 
