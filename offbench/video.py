@@ -59,7 +59,7 @@ def video(
         episodes: how many, one after the other.
         seconds: length of each at most (default: whole episodes).
         seed: of the episodes.
-        fps: frames a second.
+        fps: frames a second, about: films run in real time, and show whole steps.
         size: the longer side in pixels.
 
     Returns:
@@ -84,7 +84,7 @@ def video(
             for episode in range(episodes)
             for frame in _episode(world, policy, (seed, episode), sampled, every, seconds and seconds * rate, size)
         )
-        encode(target, frames, fps)
+        encode(target, frames, rate / every)
     return target
 
 
@@ -174,7 +174,7 @@ def _frame(env: gym.Env[Any, Any], step: int, total: float, size: int) -> Image:
     return image
 
 
-def _gif(path: Path, frames: Iterator[Image], fps: int) -> None:
+def _gif(path: Path, frames: Iterator[Image], fps: float) -> None:
     first, *rest = [frame.quantize(COLOURS) for frame in frames]
     data = io.BytesIO()
     # a GIF counts in hundredths of a second
@@ -190,7 +190,7 @@ def _encoder() -> Any:
             "mp4 needs imageio-ffmpeg: `pip install 'offbench[video]'`, or give --out video.gif"
         ) from None
 
-    def mp4(path: Path, frames: Iterator[Image], fps: int) -> None:
+    def mp4(path: Path, frames: Iterator[Image], fps: float) -> None:
         aside = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
         with disk_errors(str(path)):
             path.parent.mkdir(parents=True, exist_ok=True)
