@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from json import dumps
+from pathlib import Path
 from typing import Any
 
 from offbench.arguments import Parser, auto, natural, number, seed_list, share, whole
@@ -205,7 +206,8 @@ def _benchmark(parser: Parser, words: list[str]) -> None:
             where = RayExecutor(address)
             arguments["workers"] = arguments["workers"] or where.cpus
         finished = benchmark.benchmark(**arguments, budget=budget, shard=shard, executor=where, command=command)
-        print(tables.render(tables.score_runs(arguments["runs"])))
+        if any(Path(arguments["runs"]).rglob("evaluations.csv")):  # a small budget ends before there are any
+            print(tables.render(tables.score_runs(arguments["runs"])))
         if not finished:
             print("stopped at the budget; the same command goes on", file=sys.stderr)
 

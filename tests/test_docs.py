@@ -125,4 +125,5 @@ def test_the_site_builds_strictly(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "--site-dir", str(tmp_path / "site")]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "offbench collect" in (tmp_path / "site" / "index.html").read_text()
+    assert "Hopper-v5 at three levels" in (tmp_path / "site" / "index.html").read_text()
+    assert 'id="offbench.record.collect"' in (tmp_path / "site" / "api.html").read_text()
