@@ -85,10 +85,8 @@ def critic_loss(
     return loss, {"critic_loss": loss.detach(), "q_abs": q[0].detach().abs().mean(-1)}
 
 
-def discriminator_loss(discriminator: Network, actor: Network, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the discriminator's loss [runs], eq. 16: the data's actions are real, the policy's are not."""
-    with torch.no_grad():
-        pi = actor(batch.observations)[0].tanh()
+def discriminator_loss(discriminator: Network, pi: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the discriminator's loss [runs], eq. 16: the data's actions are real, the policy's (detached) are not."""
     real = discriminator(batch.observations, batch.actions)[0].squeeze(-1)
     fake = discriminator(batch.observations, pi)[0].squeeze(-1)
     loss = softplus(-real).mean(-1) + softplus(fake).mean(-1)
@@ -97,26 +95,26 @@ def discriminator_loss(discriminator: Network, actor: Network, batch: Batch) -> 
 
 
 def actor_loss(
-    actor: Network, critic: Network, discriminator: Network, learned_beta: Learned, batch: Batch, c: Any, warm_up: bool
+    pi: Tensor, critic: Network, discriminator: Network, learned_beta: Learned, batch: Batch, c: Any, warm_up: bool
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the actor's loss [runs], eq. 17, and what is logged."""
-    pi = actor(batch.observations)[0].tanh()
     q = critic.frozen(batch.observations, pi, copies=1)[0].squeeze(-1)  # Q1 alone: [runs, batch]
     lambda_q = c.alpha / q.detach().abs().mean(-1) * q.mean(-1)
     cloning = (pi - batch.actions).square().mean(-1)
     adversarial = softplus(-discriminator.frozen(batch.observations, pi)[0].squeeze(-1))
-    unc = uncertainty(critic, batch, pi.detach(), c)
+    others = critic.frozen(batch.observations, pi.detach(), first=1).squeeze(-1)
+    unc = uncertainty(torch.cat([q.detach().unsqueeze(0), others]), c)
     beta = mixture(unc, learned_beta, c, warm_up)
     loss = -lambda_q + (beta * adversarial + (1 - beta) * cloning).mean(-1)
     logs = {"actor_loss": loss.detach(), "lambda_q": lambda_q.detach(), "bc": cloning.detach().mean(-1)}
-    low, median, high = beta.quantile(beta.new_tensor([0.05, 0.5, 0.95]), dim=-1)
+    ordered, last = beta.sort(-1).values, beta.shape[-1] - 1
+    low, median, high = (ordered[:, round(share * last)] for share in (0.05, 0.5, 0.95))
     logs |= {"adversarial": adversarial.detach().mean(-1), "uncertainty": unc.mean(-1), "beta": beta.mean(-1)}
     return loss, logs | {"beta_5": low, "beta_50": median, "beta_95": high}
 
 
-def uncertainty(critic: Network, batch: Batch, pi: Tensor, c: Any) -> Tensor:
-    """Return max_i Q_i - min_i Q_i over the M critics at (s, pi(s)), [runs, batch] (Algorithm 2)."""
-    q = critic.frozen(batch.observations, pi).squeeze(-1)
+def uncertainty(q: Tensor, c: Any) -> Tensor:
+    """Return max_i Q_i - min_i Q_i [runs, batch] of the M critics' values q at (s, pi(s)) (Algorithm 2)."""
     unc = q.amax(0) - q.amin(0)
     if c.uncertainty == "relative":
         unc = c.uncertainty_scale * unc / q[0].abs().mean(-1, keepdim=True)
@@ -205,11 +203,12 @@ class BDB:
             loss, logs["penalty"] = loss + c.penalty_weight * penalty, penalty.detach()
         self.critic.minimize(loss.sum())
         if kind != "critic":
-            loss, more = discriminator_loss(self.discriminator, self.actor, batch)
+            pi = self.actor(batch.observations)[0].tanh()
+            loss, more = discriminator_loss(self.discriminator, pi.detach(), batch)
             self.discriminator.minimize(loss.sum())
             logs |= more
             warm_up = kind == "critic+cloning actor"
-            loss, more = actor_loss(self.actor, self.critic, self.discriminator, self.learned_beta, batch, c, warm_up)
+            loss, more = actor_loss(pi, self.critic, self.discriminator, self.learned_beta, batch, c, warm_up)
             self.actor.minimize(loss.sum())
             self.learned_beta.minimize(learned_beta_loss(self.learned_beta, more["bc"], c, warm_up).sum())
             self.actor_target.follow(c.tau)

@@ -14,7 +14,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
-OPTIONAL = ("benchmarks.md", "interop.md", "reliability.md", "cards/")
+OPTIONAL = ("benchmarks.md", "cards/")
 LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 RESULTS = "<!-- results -->"
 

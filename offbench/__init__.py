@@ -23,12 +23,16 @@ if TYPE_CHECKING:
     from offbench.agents import behaviour
     from offbench.assess import evaluate
     from offbench.comparison import compare
+    from offbench.d4rl import import_d4rl
+    from offbench.deploy import export_policy
     from offbench.describe import inventory, show
+    from offbench.exports import export
     from offbench.launch import train
     from offbench.record import collect
-    from offbench.reporting import report
+    from offbench.reports import report
     from offbench.tables import normalize_runs_or_returns as normalize
     from offbench.transitions import load
+    from offbench.verification import verify
 
 __all__ = [
     "OffbenchError",
@@ -36,12 +40,16 @@ __all__ = [
     "collect",
     "compare",
     "evaluate",
+    "export",
+    "export_policy",
+    "import_d4rl",
     "inventory",
     "load",
     "normalize",
     "report",
     "show",
     "train",
+    "verify",
 ]
 
 # Loaded when first used: `offbench list` must not wait for PyTorch.
@@ -50,12 +58,16 @@ _VERBS = {
     "collect": ("offbench.record", "collect"),
     "compare": ("offbench.comparison", "compare"),
     "evaluate": ("offbench.assess", "evaluate"),
+    "export": ("offbench.exports", "export"),
+    "export_policy": ("offbench.deploy", "export_policy"),
+    "import_d4rl": ("offbench.d4rl", "import_d4rl"),
     "inventory": ("offbench.describe", "inventory"),
     "load": ("offbench.transitions", "load"),
     "normalize": ("offbench.tables", "normalize_runs_or_returns"),
-    "report": ("offbench.reporting", "report"),
+    "report": ("offbench.reports", "report"),
     "show": ("offbench.describe", "show"),
     "train": ("offbench.launch", "train"),
+    "verify": ("offbench.verification", "verify"),
 }
 
 

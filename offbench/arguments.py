@@ -1,4 +1,4 @@
-"""What the command line is parsed with: a parser whose refusals are one line, and the words it reads as values."""
+"""Types of command-line arguments: what is typed becomes a value, or a refusal that says what was meant."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from offbench.files import write_bytes
+from offbench.policy import content_sha256
 
 KEPT = 2
 _NAME = re.compile(r"checkpoint-(\d{9,})\.safetensors")
@@ -23,7 +24,9 @@ State = dict[str, Any]
 def save_checkpoint(folder: Path, step: int, tensors: dict[str, torch.Tensor], state: State) -> None:
     """Write checkpoint-<step>.safetensors, whole or not at all."""
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    data = save(whole, metadata={"offbench": json.dumps(state, sort_keys=True)})
+    # one key, because safetensors writes several in any order, and a run's bytes should depend on the run alone
+    about = {**state, "sha256": _sha256(whole, state)}
+    data = save(whole, metadata={"offbench": json.dumps(about, sort_keys=True)})
     write_bytes(folder / f"checkpoint-{step:09d}.safetensors", data)
 
 
@@ -39,10 +42,20 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], S
     try:
         with safe_open(path, framework="pt") as file:
             state = json.loads((file.metadata() or {})["offbench"])
-            return {name: file.get_tensor(name) for name in file.keys()}, state  # noqa: SIM118
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if not isinstance(state, dict) or state.get("step") != step:
+            raise ValueError(f"it is not of step {step}")
+        recorded = state.pop("sha256", None)  # older files have none
+        if recorded is not None and recorded != _sha256(tensors, state):
+            raise ValueError("its content is not what was written (SHA-256)")
+        return tensors, state
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError) as error:
         print(f"offbench: {path} is damaged ({error}); using the one before it", file=sys.stderr)
         return None
+
+
+def _sha256(tensors: dict[str, torch.Tensor], state: State) -> str:
+    return content_sha256({name: tensor.numpy() for name, tensor in tensors.items()}, state)
 
 
 def load_newest(folder: Path) -> tuple[dict[str, torch.Tensor], State] | None:

@@ -10,6 +10,7 @@ from json import dumps
 from pathlib import Path
 from typing import Any
 
+from offbench import aids, travel
 from offbench.arguments import Parser, auto, natural, number, seed_list, share, whole
 from offbench.errors import OffbenchError, unknown
 
@@ -24,6 +25,10 @@ COMMANDS = {
     "behaviour": "train an environment's behaviour agent (SAC) and build its ladder",
     "list": "environments, levels, algorithms and local datasets",
     "show": "what is in a dataset",
+    "verify": "check a dataset: its arrays, its metadata, and a sample of episodes played again",
+    "import-d4rl": "turn a D4RL file (v0, v1, v2) into a Minari dataset",
+    "export": "write a dataset as a D4RL file, or as arrays (npz)",
+    "export-policy": "write a run's policy as TorchScript",
     "card": "write an environment's dataset card from its five recorded levels",
     "video": "film a run's policy, a policy file, or a level such as hopper:medium",
     "doctor": "what a bug report needs: versions, physics, machine, paths; exit code 1 if something is broken",
@@ -33,7 +38,10 @@ SWITCHES = ("--tf32", "--tensorboard")  # flags of `train` without a value: the 
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run one command; exit with 0, with 2 for a problem the user can mend, with 130 after Ctrl-C."""
+    """Run one command.
+
+    Exits with 0, 1 if `verify` found something, 2 for a problem the user can mend, 130 after Ctrl-C.
+    """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         _run(words)
@@ -271,7 +279,7 @@ def _report(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--out", default="report", metavar="DIR", help="where the report goes (default: report)")
 
     def run(**arguments: Any) -> None:
-        from offbench.reporting import report
+        from offbench.reports import report
 
         print(f"report in {report(**arguments)}")
 
@@ -329,53 +337,6 @@ def _card(parser: Parser, _: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
-def _video(parser: Parser, _: list[str]) -> None:
-    parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run, a policy file, or ENV:LEVEL (hopper:medium)")
-    parser.add_argument("--out", default="video.mp4", metavar="FILE", help=".mp4 or .gif (default: video.mp4)")
-    parser.add_argument("--env", help="a recipe, instead of the environment the policy names")
-    parser.add_argument("--episodes", type=whole, default=1, help="default: 1")
-    parser.add_argument("--seconds", type=number, help="length of an episode at most (default: whole)")
-    parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
-    parser.add_argument("--fps", type=whole, default=25, help="frames a second (default: 25)")
-    parser.add_argument("--size", type=whole, default=480, help="longer side in pixels (default: 480)")
-
-    def run(**arguments: Any) -> None:
-        from offbench.video import video
-
-        print(f"film in {video(**arguments)}")
-
-    parser.set_defaults(run=run)
-
-
-def _doctor(parser: Parser, _: list[str]) -> None:
-    parser.add_argument("--json", action="store_true", help="print JSON")
-
-    def run(json: bool) -> None:
-        from offbench.doctor import BROKEN, as_json, doctor
-
-        found = doctor()
-        print(dumps(as_json(found), indent=1) if json else "\n".join(map(str, found)))
-        sys.exit(any(finding.state == BROKEN for finding in found))
-
-    parser.set_defaults(run=run)
-
-
-def _completion(parser: Parser, _: list[str]) -> None:
-    from offbench.completion import SHELLS, script
-
-    parser.add_argument("shell", choices=SHELLS)
-
-    def fill(words: list[str]) -> Parser:
-        sub = Parser(prog="offbench")
-        ADD[words[0]](sub, words[1:])
-        return sub
-
-    def run(shell: str) -> None:
-        print(script(shell, COMMANDS, fill))
-
-    parser.set_defaults(run=run)
-
-
 ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "collect": _collect,
     "train": _train,
@@ -387,8 +348,12 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "behaviour": _behaviour,
     "list": _list,
     "show": _show,
+    "verify": travel.verify_arguments,
+    "import-d4rl": travel.import_arguments,
+    "export": travel.export_arguments,
+    "export-policy": travel.export_policy_arguments,
     "card": _card,
-    "video": _video,
-    "doctor": _doctor,
-    "completion": _completion,
+    "video": aids.video_arguments,
+    "doctor": aids.doctor_arguments,
+    "completion": aids.completion_arguments,
 }

@@ -74,10 +74,10 @@ def _bash(commands: Mapping[str, str], tables: Mapping[tuple[str, ...], argparse
         pattern = " ".join(words) if len(words) == 2 else f"{words[0]} "
         flags.append(f"                {_quoted(pattern)}{'' if len(words) == 2 else '*'}) found={_list(options)} ;;")
         for action in _options(parser):
-            if known := _words(words[0], action):
+            if known := _words(action):
                 patterns = "|".join(f'"{words[0]} {flag}"' for flag in action.option_strings)
                 values.append(f"        {patterns}) found={_list(known)} ;;")
-        if len(words) == 1 and (known := [w for place in _places(parser) for w in _words(words[0], place)]):
+        if len(words) == 1 and (known := [w for place in _places(parser) for w in _words(place)]):
             places.append(f"                {words[0]}) found={_list(known)} ;;")
     lines = {"values": dict.fromkeys(values), "flags": flags, "places": places}
     return BASH % {"commands": " ".join(commands), **{key: "\n".join(part) for key, part in lines.items()}}
@@ -93,11 +93,11 @@ def _fish(commands: Mapping[str, str], tables: Mapping[tuple[str, ...], argparse
     for words, parser in tables.items():
         seen = "; and ".join(f"__fish_seen_subcommand_from {word}" for word in words)
         for action in _options(parser):
-            known, name = _words(words[0], action), action.option_strings[-1].lstrip("-")
+            known, name = _words(action), action.option_strings[-1].lstrip("-")
             takes = "" if action.nargs == 0 else f" -x -a {_list(known, fish=True)}" if known else " -r -F"
             text = (action.help or "").replace("%%", "%")
             lines.append(f"complete -c offbench -n '{seen}' -l {name}{takes} -d {_quoted(text)}")
-        if known := [word for place in _places(parser) for word in _words(words[0], place)]:
+        if known := [word for place in _places(parser) for word in _words(place)]:
             lines.append(f"complete -c offbench -n '{seen}' -a {_list(known, fish=True)}")
         elif _places(parser):
             lines.append(f"complete -c offbench -n '{seen}' -F")
@@ -112,7 +112,7 @@ def _places(parser: argparse.ArgumentParser) -> list[argparse.Action]:
     return [action for action in parser._actions if not action.option_strings]
 
 
-def _words(command: str, action: argparse.Action) -> Sequence[str]:
+def _words(action: argparse.Action) -> Sequence[str]:
     """Return what an argument may be: its choices, or what its name stands for."""
     if action.choices is not None:
         return [str(choice) for choice in action.choices]
@@ -124,8 +124,8 @@ def _words(command: str, action: argparse.Action) -> Sequence[str]:
         "dataset": [DATASETS],
         "dataset_id": [DATASETS],
     }
-    if action.dest == "dataset_id" and command == "collect":
-        return []  # a new one
+    if action.dest == "dataset_id" and action.option_strings:
+        return []  # --id names a new one
     return known.get(action.dest, [])
 
 

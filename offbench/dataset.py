@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 import shutil
 import warnings
@@ -11,14 +12,16 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from filelock import FileLock, Timeout
 from gymnasium.envs.registration import EnvSpec
 
 from offbench.errors import OffbenchError, unknown
-from offbench.files import disk_errors, read_json
+from offbench.files import disk_errors, read_json, sole
 from offbench.policy import Array
 from offbench.rollout import Episode
+from offbench.safefile import SafeFile, safe_file
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -68,13 +71,51 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
         OffbenchError: no such dataset (the nearest id is named), or its metadata are damaged.
     """
     path = root() / dataset_id / "data" / "metadata.json"
-    if dataset_id.startswith((".", "/")) or ".." in Path(dataset_id).parts or not path.exists():
+    if not exists(dataset_id):
         hint = "record one with `offbench collect ENV --level LEVEL`"
         raise OffbenchError(f"{unknown('dataset', dataset_id, local_ids())}; {hint}")
     metadata = read_json(path)
+    try:
+        _check_metadata(metadata)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise OffbenchError(f"{path} is damaged: {error}; record or download the dataset again") from None
+    return dict(metadata)
+
+
+TEXTS = ("env_spec", "eval_env_spec", "observation_space", "action_space", "algorithm_name", "description")
+NUMBERS = ("ref_min_score", "ref_max_score", "total_steps", "total_episodes")
+
+
+def _check_metadata(metadata: Any) -> None:
+    """Raise ValueError if a field that is read here is of another kind than it should be; all may be missing."""
     if not isinstance(metadata, dict):
-        raise OffbenchError(f"{path} is damaged: not a table; record or download the dataset again")
-    return metadata
+        raise ValueError("not a table")
+    for key in (*TEXTS, *NUMBERS):
+        value = metadata.get(key)
+        number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e15
+        if value is not None and not (isinstance(value, str) if key in TEXTS else number):
+            raise ValueError(f"{key} is {str(value)[:40]!r}")
+    for key in ("env_spec", "eval_env_spec"):
+        spec = json.loads(metadata.get(key) or "null")
+        if spec is not None and not (isinstance(spec, dict) and isinstance(spec.get("id"), str)):
+            raise ValueError(f"{key} names no environment")
+    ours = metadata.get(KEY)
+    if ours is None:
+        return
+    kinds = {"versions": dict, "references": dict, "imported": dict, "parts": list, "content_sha256": str}
+    for key, kind in kinds.items():
+        if not isinstance(ours, dict) or not isinstance(ours.get(key, kind()), kind):
+            raise ValueError(f"{KEY}.{key} is of another kind")
+    if not all(isinstance(part, dict) for part in ours.get("parts", [])):
+        raise ValueError(f"{KEY}.parts are of another kind")
+    if not all(isinstance(version, str) for version in ours.get("versions", {}).values()):
+        raise ValueError(f"{KEY}.versions are of another kind")
+
+
+def exists(dataset_id: str) -> bool:
+    """Return whether there is a local dataset of this id, sound or not."""
+    inside = not dataset_id.startswith((".", "/")) and ".." not in Path(dataset_id).parts and "\0" not in dataset_id
+    return inside and (root() / dataset_id / "data" / "metadata.json").exists()
 
 
 def provenance(metadata: dict[str, Any]) -> dict[str, Any]:
@@ -127,23 +168,25 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
             folder cannot be written.
     """
     path = path_of(dataset_id)
-    with disk_errors(str(path)):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(_lock_path(path))
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            raise OffbenchError(f"{dataset_id} is being recorded by another process; wait for it") from None
-    try:
-        _recover(path)
+    if not path.parent.resolve().is_relative_to(root().resolve()):
+        raise OffbenchError(f"{dataset_id} leads out of {root()} by a link; choose another id")
+    with sole(_lock_path(path), f"{dataset_id} is being recorded"):
+        with disk_errors(str(path)):
+            _recover(path)
         if path.exists() and not overwrite:
             raise OffbenchError(f"{dataset_id} exists already; use --overwrite to replace it, or --id for another id")
         yield path
-    finally:
-        lock.release()
 
 
-def write(path: Path, episodes: Iterable[Episode], spec: str, metadata: dict[str, Any], steps: int) -> str:
+def write(
+    path: Path,
+    episodes: Iterable[Episode],
+    spec: str,
+    metadata: dict[str, Any],
+    steps: int,
+    spaces: tuple[gym.Space[Any], gym.Space[Any]] | None = None,
+    expected: str | None = None,
+) -> str:
     """Write episodes as a Minari HDF5 dataset at `path`, whole or not at all; return the content hash.
 
     Args:
@@ -151,6 +194,8 @@ def write(path: Path, episodes: Iterable[Episode], spec: str, metadata: dict[str
         spec: the environment's EnvSpec as JSON.
         metadata: Minari's fields; the content hash joins those under the key `offbench`.
         steps: transitions to come, to see beforehand whether the disk has room.
+        spaces: of observations and actions, where the environment is not to be asked (it may be no longer there).
+        expected: the content hash to come, where it is known; any other content is refused.
     """
     env_spec = EnvSpec.from_json(spec)
     aside, old = path.with_name(f".offbench-{path.name}.partial"), _old(path)
@@ -160,10 +205,15 @@ def write(path: Path, episodes: Iterable[Episode], spec: str, metadata: dict[str
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                storage = MinariStorage.new(aside / "data", env_spec=env_spec, data_format="hdf5")
+                storage = MinariStorage.new(aside / "data", *(spaces or (None, None)), env_spec, "hdf5")
             _check_room(aside, storage, steps)
-            content = ContentHash()
-            storage.update_episodes(_buffers(episodes, storage.observation_space.dtype, content))
+            content, dtype = ContentHash(), storage.observation_space.dtype
+            with safe_file(storage._file_path) as storage._file_path:  # so that a full disk is no crash
+                storage.update_episodes(_buffers(episodes, dtype, content, storage._file_path))
+            if expected not in (None, content.hexdigest()):
+                raise OffbenchError(
+                    "the data are not those that were exported (their hash differs); export them again"
+                )
             ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
             storage.update_metadata(metadata | {KEY: ours})
             if path.exists():
@@ -185,11 +235,14 @@ def _recover(path: Path) -> None:
     old = _old(path)
     if old.exists() and not path.exists():
         old.replace(path)
+    if old.is_symlink():
+        old.unlink()  # never what it leads to
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _buffers(episodes: Iterable[Episode], dtype: Any, content: ContentHash) -> Iterator[EpisodeBuffer]:
+def _buffers(episodes: Iterable[Episode], dtype: Any, content: ContentHash, file: SafeFile) -> Iterator[EpisodeBuffer]:
     for episode in episodes:
+        file.check()
         observations = episode.observations.astype(dtype, copy=False)
         ends = (episode.terminated, episode.truncated)
         content.add(observations, episode.actions, episode.rewards, ends)

@@ -91,21 +91,17 @@ class Summary:
             f"return       mean {self.returns.mean():.1f}, std {self.returns.std():.1f}, "
             f"{self.returns.min():.1f} to {self.returns.max():.1f}",
         ]
-        if low is not None and high is not None:
+        if low is not None and high is not None and high > low:
             score = normalize(float(self.returns.mean()), float(low), float(high))
             lines.append(f"references   random {low:.1f}, expert {high:.1f}: normalized mean return {score:.1f}")
         lines += ["", *_histogram(self.returns), ""]
         for part in ours.get("parts", []):
             words = ", ".join(f"{key} {value}" for key, value in part.items())
             lines.append(f"made from    {words}")
-        if ours:
-            made = ", ".join(f"{name} {version}" for name, version in ours["versions"].items())
-            lines += [
-                f"seed         {ours['seed']}",
-                f"versions     {made}",
-                f"content      sha256 {ours['content_sha256']}",
-            ]
-        return lines
+        made = ", ".join(f"{name} {version}" for name, version in ours.get("versions", {}).items())
+        told = {"seed": ours.get("seed"), "versions": made or None, "content": ours.get("content_sha256")}
+        told["imported"] = ours.get("imported", {}).get("file")
+        return lines + [f"{key:<12} {value}" for key, value in told.items() if value is not None]
 
     def plot(self, path: str | Path) -> Path:
         """Draw the histogram of returns. Raises OffbenchError if the picture cannot be written."""

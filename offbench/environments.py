@@ -40,28 +40,40 @@ def checked_spec(text: str, where: str, observation_dim: int, action_dim: int) -
     Raises:
         OffbenchError: it names code that is no Gymnasium environment, cannot be made, or has other shapes.
     """
+    env = believed_env(text, where)
+    _check_spaces(env, where)
+    shapes = (env.observation_space.shape, env.action_space.shape)
+    if shapes != ((observation_dim,), (action_dim,)):
+        raise OffbenchError(
+            f"{where} takes observations ({observation_dim},) and actions ({action_dim},); the environment "
+            f"{env.spec.id if env.spec else '?'} has {shapes[0]} and {shapes[1]}: give the right one"
+        )
+    return text
+
+
+def believed_env(text: str, where: str) -> gym.Env[Any, Any]:
+    """Make the environment of an EnvSpec (JSON) that came in a file, if what it names is an environment.
+
+    Raises:
+        OffbenchError: it names code that is no Gymnasium environment, or cannot be made.
+    """
     try:
-        spec = EnvSpec.from_json(text)
-        _check_code(spec)
-        env = make_env(text)
+        check_code(EnvSpec.from_json(text))
+        return make_env(text)
     except OffbenchError as error:
         raise OffbenchError(f"{where}: {error}") from None
     except Exception as error:  # see env_spec
         raise OffbenchError(
             f"{where}: cannot make its environment: {_reason(error)}; install or import the package it comes from"
         ) from error
-    _check_spaces(env, where)
-    shapes = (env.observation_space.shape, env.action_space.shape)
-    if shapes != ((observation_dim,), (action_dim,)):
-        raise OffbenchError(
-            f"{where} takes observations ({observation_dim},) and actions ({action_dim},); the environment {spec.id} "
-            f"has {shapes[0]} and {shapes[1]}: give the right one"
-        )
-    return text
 
 
-def _check_code(spec: EnvSpec) -> None:
-    """Refuse entry points that are no environments: `os:system` would run whatever a file says."""
+def check_code(spec: EnvSpec) -> None:
+    """Refuse entry points that are no environments: `os:system` would run whatever a file says.
+
+    Raises:
+        OffbenchError: what it names is no environment or wrapper class.
+    """
     registered = gym.registry.get(spec.id)
     if registered is None or registered.entry_point != spec.entry_point:
         _check_class(spec.entry_point, gym.Env)

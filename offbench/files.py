@@ -8,9 +8,12 @@ import hashlib
 import io
 import json
 import os
+import socket
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from offbench.errors import OffbenchError
 
@@ -25,6 +28,41 @@ def disk_errors(what: str) -> Iterator[None]:
             raise
         reason = error.strerror or str(error)
         raise OffbenchError(f"cannot write {what}: {reason}; free some room or choose another folder") from error
+
+
+@contextlib.contextmanager
+def sole(lock: Path, what: str) -> Iterator[None]:
+    """Hold a lock file for this process, so that no other does the same work.
+
+    Args:
+        lock: its path, a hidden name; beside it lies who holds it, for the other process to say.
+        what: what is held and how, e.g. "hopper-medium-v0 is being recorded".
+
+    Raises:
+        OffbenchError: another process holds it; its process id and host are named.
+    """
+    held, holder = FileLock(lock), lock.with_suffix(".holder")
+    with disk_errors(str(lock.parent)):
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            held.acquire(timeout=0)
+        except Timeout:
+            raise OffbenchError(f"{what} by {_holder(holder)}; wait for it, or stop it") from None
+    try:
+        with disk_errors(str(lock.parent)):
+            holder.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
+        yield
+    finally:
+        holder.unlink(missing_ok=True)
+        held.release()
+
+
+def _holder(path: Path) -> str:
+    try:
+        words = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        words = ""
+    return words if words.startswith("process ") and len(words) < 300 else "another process"
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -70,3 +108,9 @@ def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
 def sha256(data: bytes) -> str:
     """Return the hexadecimal SHA-256 of `data`."""
     return hashlib.sha256(data).hexdigest()
+
+
+def sha256_of(path: Path) -> str:
+    """Return the hexadecimal SHA-256 of a file, read in pieces."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

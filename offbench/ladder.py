@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 import sys
 from collections.abc import Iterable, Iterator
@@ -41,6 +42,8 @@ MEDIUM = 1 / 3  # of the expert's normalised return
 MEDIUM_AT_MOST = 0.45  # a rung beyond this is no medium while there is another
 CANDIDATES = 8  # late rungs that are measured to find the expert
 LOOKS = 6  # rungs that are measured to find the one nearest a return
+POLICY_NAME = re.compile(r"\w[\w.-]*\.safetensors")  # a file of the ladder's own folder, nothing else
+REFERENCE = ("return", "low", "high", "episodes")  # what each reference must have
 COLUMNS = ("step", "hours", "role", "policy", *MEASURES, *(f"deterministic_{m}" for m in MEASURES), "episodes")
 
 
@@ -116,10 +119,24 @@ def read_ladder(folder: Path) -> Ladder | None:
         with open(folder / "ladder.csv", newline="", encoding="utf-8") as file:
             rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
         ladder = Ladder(folder, info, rungs)
-        known = [ladder.random_return, ladder.expert_return, int(info["medium_replay"]["transitions"])]
+        known = [float(info["references"][name][key]) for name in ("random", "expert") for key in REFERENCE]
+        known += [int(info["medium_replay"]["transitions"]), int(info["levels"]["medium"])]
         if not (np.isfinite(known).all() and ladder.role("medium") and ladder.role("expert")):
             raise ValueError("its references are not numbers")
-    except (OSError, KeyError, ValueError, TypeError, AttributeError, StopIteration) as error:
+        if not ladder.random_return < ladder.expert_return or not isinstance(info["medium_replay"]["sha256"], str):
+            raise ValueError("its references are out of order, or medium-replay has no hash")
+        if not isinstance(info.get("versions", {}), dict):
+            raise ValueError("its versions are no table")
+    except (
+        OSError,
+        LookupError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        StopIteration,
+        OverflowError,
+        csv.Error,
+    ) as error:
         raise OffbenchError(
             f"the ladder in {folder} is damaged ({error!r}); delete it and build it again with `offbench behaviour`"
         ) from None
@@ -137,7 +154,7 @@ def shipped_references(env_id: str) -> tuple[float, float] | None:
 
 def _rung(row: dict[str, str]) -> Rung:
     mean, low, high = (float(row[key]) for key in ("return", "low", "high"))
-    if not np.isfinite([mean, low, high]).all() or "/" in row["policy"]:
+    if not np.isfinite([mean, low, high]).all() or not POLICY_NAME.fullmatch(row["policy"]):
         raise ValueError(f"rung {row['step']}")
     return Rung(int(row["step"]), row["role"], row["policy"], mean, low, high, int(row["episodes"]))
 
@@ -294,7 +311,8 @@ def _write(
         shutil.rmtree(aside, ignore_errors=True)
         (aside / "policies").mkdir(parents=True)
         for step in roles:
-            shutil.copyfile(training.policy(step), aside / "policies" / training.policy(step).name)
+            # written anew: a policy of an older offbench has no hash of its own yet
+            load_policy(training.policy(step)).save(aside / "policies" / training.policy(step).name)
         write_bytes(aside / "ladder.csv", csv_bytes(COLUMNS, _table(training, rows, surveyor, roles)))
         info["medium_replay"] = save_replay(
             aside / "medium-replay.hdf5", replay_episodes(training, info["levels"]["medium"])

@@ -86,9 +86,9 @@ class Network(Learned):
         """Return the outputs [copies, runs, batch, out] for inputs [runs, batch, dim], concatenated."""
         return self.forward(self.flat, *inputs)
 
-    def frozen(self, *inputs: Tensor, copies: int | None = None) -> Tensor:
-        """Like a call, with no gradient to the weights; `copies` takes the first few copies alone."""
-        return self.forward(self.flat.detach()[:copies], *inputs)
+    def frozen(self, *inputs: Tensor, first: int = 0, copies: int | None = None) -> Tensor:
+        """Like a call, with no gradient to the weights, of the copies from `first` up to `copies` alone."""
+        return self.forward(self.flat.detach()[first:copies], *inputs)
 
     def forward(self, flat: Tensor, *inputs: Tensor) -> Tensor:
         """Return the outputs [copies, runs, batch, out] of the networks in `flat`."""

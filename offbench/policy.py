@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ ACTIVATIONS: dict[str, Callable[[Array], Any]] = {  # in place
     "tanh": lambda x: np.tanh(x, out=x),
 }
 NETWORKS = ("layers", "critic")
+MOST_SAMPLES = 10_000  # actions to choose from; more would fill the memory
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # Stable-Baselines3's bounds, and CQL's
 
 
@@ -141,6 +143,7 @@ class Policy:
             "activation": self.activation,
         }
         arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in tensors.items()}
+        header["sha256"] = content_sha256(arrays, header)
         return bytes(save(arrays, metadata={"offbench": json.dumps(header, sort_keys=True)}))
 
     def save(self, path: Path) -> None:
@@ -182,6 +185,9 @@ def from_bytes(data: bytes) -> Policy:
     except (SafetensorError, KeyError, TypeError) as error:  # KeyError: a dtype that NumPy lacks
         raise ValueError(f"not safetensors ({error})") from None
     header = _header(data)
+    recorded = header.pop("sha256", None)  # older files have none
+    if recorded is not None and recorded != content_sha256(tensors, header):
+        raise ValueError("its content is not what was written (SHA-256)")
     kind = header.get("kind")
     if header.get("format") != "offbench-policy-1" or kind not in KINDS:
         raise ValueError(f"unknown format {header.get('format')!r} or kind {kind!r}")
@@ -191,18 +197,33 @@ def from_bytes(data: bytes) -> Policy:
     if set(tensors) != wanted:
         raise ValueError(f"tensors {sorted(wanted.symmetric_difference(tensors))} are missing or too many")
     env_id, origin, samples = header.get("env_id"), header.get("origin"), header.get("samples", 1)
-    if not isinstance(env_id, str) or not isinstance(origin, dict) or not isinstance(samples, int) or samples < 1:
+    if (
+        not isinstance(env_id, str)
+        or not isinstance(origin, dict)
+        or not isinstance(samples, int)
+        or not 1 <= samples <= MOST_SAMPLES
+    ):
         raise ValueError("its header lacks env_id or origin, or has odd samples")
     layers, critic = (
         tuple((tensors[f"{net}.{i}.weight"], tensors[f"{net}.{i}.bias"]) for i in range(n)) for net, n in sizes.items()
     )
     mean, std, low, high = (tensors[name] for name in ("observation_mean", "observation_std", "low", "high"))
     activation = header.get("activation", "relu")
-    if activation not in ACTIVATIONS:
+    if not isinstance(activation, str) or activation not in ACTIVATIONS:
         raise ValueError(f"unknown activation {activation!r}")
     policy = Policy(kind, layers, mean, std, low, high, env_id, origin, critic, samples, activation)
     _check_shapes(policy)
     return policy
+
+
+def content_sha256(arrays: Mapping[str, Array], state: Mapping[str, Any]) -> str:
+    """Return a hash over named arrays and the JSON beside them, so that a flipped bit is no other number."""
+    plain = json.loads(json.dumps(state))  # as it will be read: tuples are lists, keys are text
+    content = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
+    for name in sorted(arrays):
+        content.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}".encode())
+        content.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return content.hexdigest()
 
 
 def _header(data: bytes) -> dict[str, Any]:

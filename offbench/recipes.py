@@ -109,7 +109,7 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise OffbenchError(f"no recipe file {path}; write one like those in datasets/") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # not UTF-8, not TOML, a number of 5000 digits, a bomb
         raise OffbenchError(f"{where}: not a readable TOML file ({error})") from None
     values.setdefault("name", path.stem if folder is None else folder.name)
     values["env_kwargs"] = _kwargs(values.pop("env_kwargs", {}), where)
@@ -130,7 +130,13 @@ def _table(value: Any, key: str, where: str) -> dict[str, Any]:
 
 
 def _kwargs(value: Any, where: str) -> tuple[tuple[str, Any], ...]:
-    return tuple(sorted(_table(value, "env_kwargs", where).items()))
+    table = _table(value, "env_kwargs", where)
+    try:
+        json.dumps(table)
+    except (TypeError, ValueError):  # a date, a number of 5000 digits
+        words = "numbers, text, true, false, lists and tables"
+        raise OffbenchError(f"{where}: env_kwargs may hold {words} only") from None
+    return tuple(sorted(table.items()))
 
 
 def _check(recipe: Recipe, where: str) -> None:

@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -148,7 +148,7 @@ def play(task: Task) -> list[Episode] | list[Outcome]:
     """Play a task's episodes and return them in its order."""
     policy = _policy(task.policy)
     noisy = policy.needs_noise(task.deterministic)
-    envs = _envs(task.spec, min(LANES, len(task.indices)))
+    envs = kept_envs(task.spec, min(LANES, len(task.indices)))
     waiting = iter(range(len(task.indices)))
     lanes = [_Lane(env, policy, task, slot) for env, slot in zip(envs, waiting, strict=False)]
     done: list[Any] = [None] * len(task.indices)
@@ -180,7 +180,7 @@ def _pool_of_envs(spec: str) -> list[gym.Env[Any, Any]]:
     return []
 
 
-def _envs(spec: str, count: int) -> list[gym.Env[Any, Any]]:
+def kept_envs(spec: str, count: int) -> list[gym.Env[Any, Any]]:
     """Return `count` environments of this process, made once and kept."""
     pool = _pool_of_envs(spec)
     while len(pool) < count:
@@ -210,14 +210,18 @@ class Rollouts:
 
     def submit(self, task: Task) -> Future[Any]:
         """Start a task; its result is the list that `play` returns."""
+        return self.call(play, task)
+
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Start a module's function in a worker process, or run it now if there is none."""
         if self._pool:
             with quiet_start():
                 try:
-                    return self._pool.submit(play, task)
+                    return self._pool.submit(function, *arguments)
                 except BrokenProcessPool:
                     raise _worker_died() from None
         future: Future[Any] = Future()
-        future.set_result(play(task))
+        future.set_result(function(*arguments))
         return future
 
     def episodes(self, policy: Policy, seed: int, stream: tuple[int, ...] = ()) -> Iterator[Episode]:

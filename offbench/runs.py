@@ -24,7 +24,11 @@ from offbench.files import csv_bytes, read_json, write_bytes, write_json
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 FORMAT = "offbench-run-1"
-REQUIRED = ("algorithm", "variant", "settings", "dataset", "dataset_sha256", "seed", "steps", "references")
+REQUIRED = {  # what a config.json must hold, and of which kind
+    **dict.fromkeys(("algorithm", "variant", "dataset", "dataset_sha256"), str),
+    **dict.fromkeys(("seed", "steps"), int),
+    **dict.fromkeys(("settings", "references"), dict),
+}
 MUST_MATCH = ("algorithm", "settings", "dataset", "dataset_sha256", "seed", "eval_every", "eval_episodes")
 
 
@@ -52,9 +56,16 @@ class Run:
     def config(self) -> dict[str, Any]:
         """Read config.json. Raises OffbenchError if it is missing or damaged."""
         config = read_json(self.config_path)
-        missing = [key for key in REQUIRED if not isinstance(config, dict) or key not in config]
-        if missing:
-            raise OffbenchError(f"{self.config_path} is damaged: it lacks {missing[0]}; delete the run to repeat it")
+        for key, kind in REQUIRED.items():
+            if not isinstance(config, dict) or not _is(config.get(key), kind):
+                raise OffbenchError(
+                    f"{self.config_path} is damaged: it lacks {key}, or has an odd one; delete the run to repeat it"
+                )
+        config["references"] = {name: config["references"].get(name) for name in ("dataset", "d4rl")}
+        for pair in config["references"].values():
+            sound = isinstance(pair, list) and len(pair) == 2 and all(_is(value, float) for value in pair)
+            if pair is not None and not (sound and pair[0] != pair[1]):
+                raise OffbenchError(f"{self.config_path} is damaged: odd references; delete the run to repeat it")
         return dict(config)
 
     def claim(self, config: Mapping[str, Any]) -> None:
@@ -129,8 +140,16 @@ class Run:
         try:
             with open(path, newline="", encoding="utf-8") as file:
                 return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
-        except (ValueError, TypeError, csv.Error) as error:
+        except (OSError, ValueError, TypeError, csv.Error) as error:
             raise OffbenchError(f"{path} is damaged: {error}; delete the run to repeat it") from None
+
+
+def _is(value: Any, kind: type) -> bool:
+    """Return whether a JSON value is of a kind; numbers must be finite, and true is no number."""
+    if kind in (int, float):
+        kinds = int if kind is int else int | float
+        return isinstance(value, kinds) and not isinstance(value, bool) and abs(value) < 1e15
+    return isinstance(value, kind)
 
 
 def _short(value: Any) -> Any:

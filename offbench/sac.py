@@ -22,7 +22,6 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 import torch
-from filelock import FileLock, Timeout
 from stable_baselines3 import SAC
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -31,7 +30,7 @@ from offbench import checkpoints, seeds
 from offbench.checkpoints import keep_newest, load_newest, save_checkpoint
 from offbench.environments import make_env
 from offbench.errors import OffbenchError
-from offbench.files import csv_bytes, disk_errors, read_json, write_bytes, write_json
+from offbench.files import csv_bytes, disk_errors, read_json, sole, write_bytes, write_json
 from offbench.policy import Array, Policy
 from offbench.progress import Progress
 from offbench.provenance import hardware, versions
@@ -71,15 +70,10 @@ def train(training: Training, steps: int) -> None:
     Raises:
         OffbenchError: the folder belongs to another recipe or seed, is in use, or the disk refuses.
     """
-    with disk_errors(str(training.folder)):
-        training.folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(training.folder / ".lock", timeout=0):
-            _claim(training)
-            if max(checkpoints.steps(training.folder), default=0) < steps:
-                _train(training, steps)
-    except Timeout:
-        raise OffbenchError(f"{training.folder} is in use by another offbench process; wait for it") from None
+    with sole(training.folder / ".lock", f"{training.folder} is being trained"):
+        _claim(training)
+        if max(checkpoints.steps(training.folder), default=0) < steps:
+            _train(training, steps)
 
 
 def _claim(training: Training) -> None:

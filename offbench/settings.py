@@ -79,13 +79,21 @@ def check(cls: type, name: str, value: Any, where: str) -> Any:
     hint = typing.get_type_hints(cls)[name]
     try:
         value = _convert(value, hint)
-    except (TypeError, ValueError):
-        raise OffbenchError(f"{where}: {name} must be {_describe(hint)}, not {value!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise OffbenchError(f"{where}: {name} must be {_describe(hint)}, not {_shown(value)}") from None
     metadata = fields(cls)[name].metadata
     numbers = value if isinstance(value, tuple) else (value,)
     for number in numbers:
         _check_range(name, number, metadata, where)
     return value
+
+
+def _shown(value: Any) -> str:
+    """Return a value for an error line, whatever a file held."""
+    try:
+        return f"{value!r:.60}"
+    except (ValueError, RecursionError):  # Python prints no number of 5000 digits
+        return "that"
 
 
 def _check_range(name: str, value: Any, metadata: Mapping[str, Any], where: str) -> None:
@@ -94,6 +102,8 @@ def _check_range(name: str, value: Any, metadata: Mapping[str, Any], where: str)
         raise OffbenchError(f"{where}: {name} must be one of {', '.join(choices)}, not {value!r}")
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
+    if isinstance(value, int) and abs(value) >= 2**63:
+        raise OffbenchError(f"{where}: {name} is too large a number")
     low, above, high = metadata.get("low"), metadata.get("above"), metadata.get("high")
     if not math.isfinite(value):
         raise OffbenchError(f"{where}: {name} must be a finite number, not {value}")

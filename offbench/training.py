@@ -8,19 +8,18 @@ a run that diverges:     is left out from there on and marked; the others go on,
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 
 import numpy as np
-from filelock import FileLock, Timeout
 
 from offbench import checkpoints
 from offbench.algorithm import Algorithm
 from offbench.batches import Member
-from offbench.errors import OffbenchError
-from offbench.files import disk_errors
+from offbench.files import disk_errors, sole
 from offbench.loggers import NOWHERE, Destinations, Loggers
 from offbench.rollout import Outcome, Rollouts, result
 from offbench.runs import Run
@@ -156,7 +155,7 @@ class Trainer:
             known, rows = member.run.evaluations(), member.run.losses()
             # an evaluation at the end of a shorter schedule may lie off this one's grid
             self.evaluations[run] = {s: e for s, e in known.items() if s <= self.stack.step and self._evaluates_at(s)}
-            self.losses[run] = [row for row in rows if row["step"] <= self.stack.step]
+            self.losses[run] = [row for row in rows if row.get("step", math.inf) <= self.stack.step]
 
     def _checkpoint(self) -> None:
         """Write everything up to now."""
@@ -222,14 +221,5 @@ class Trainer:
 @contextlib.contextmanager
 def held(run: Run) -> Iterator[None]:
     """Hold a run's directory for this process. Raises OffbenchError if another one trains it."""
-    with disk_errors(str(run.folder)):
-        run.folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(run.folder / ".lock")
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            raise OffbenchError(f"{run.folder} is being trained by another process; wait for it") from None
-    try:
+    with sole(run.folder / ".lock", f"{run.folder} is being trained"):
         yield
-    finally:
-        lock.release()

@@ -104,7 +104,7 @@ def load(dataset_id: str) -> Transitions:
             damaged files.
     """
     metadata = dataset.read_metadata(dataset_id)
-    data = _open(dataset_id)
+    data = open_minari(dataset_id)
     observation_space = box(data.observation_space, f"{dataset_id}: observations")
     action_space = box(data.action_space, f"{dataset_id}: actions")
     if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
@@ -139,13 +139,23 @@ def _key(dataset_id: str, metadata: dict[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def _open(dataset_id: str) -> Any:
+def open_minari(dataset_id: str) -> Any:
+    """Return the MinariDataset of a local id. Raises OffbenchError if there is none, or it is damaged."""
+    metadata = dataset.read_metadata(dataset_id)
+    if "observation_space" not in metadata or "action_space" not in metadata:
+        # Minari would make the environment to ask it, running whatever code the file names
+        raise OffbenchError(f"{dataset_id} cannot be read: its metadata lack a space; record or download it again")
+    size = sum(path.stat().st_size for path in (dataset.root() / dataset_id / "data").rglob("*") if path.is_file())
+    if not 0 <= (metadata.get("total_episodes") or 0) <= size:
+        raise OffbenchError(
+            f"{dataset_id} cannot be read: its files are too small for its episodes; download it again"
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import minari
 
         try:
-            return minari.MinariDataset(dataset.path_of(dataset_id) / "data")
+            return minari.MinariDataset(dataset.root() / dataset_id / "data")
         except Exception as error:  # Minari, h5py and JSON each raise their own kinds for damaged files
             raise OffbenchError(f"{dataset_id} cannot be read: {error}; record or download it again") from error
 

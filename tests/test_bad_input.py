@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import h5py
 import numpy as np
 import pytest
 
@@ -85,6 +86,35 @@ CASES: dict[str, tuple[str, str]] = {
     "show x-v0": ("unknown dataset 'x-v0'", ""),
     "show MEDIM": ("did you mean 'tiny-medium-v0'?", ""),
     "show MEDIUM --plot out.gif": ("a picture's name must end in .png, .svg, .pdf, not 'out.gif'", ""),
+    "verify": ("the following arguments are required: ID", ""),
+    "verify x-v0": ("unknown dataset 'x-v0'", "offbench collect"),
+    "verify MEDIM": ("did you mean 'tiny-medium-v0'?", ""),
+    "verify ../MEDIUM": ("unknown dataset '../MEDIUM'", ""),
+    "verify /etc": ("unknown dataset '/etc'", ""),
+    "verify MEDIUM --episodes -1": ("'-1' is not a whole number from 0", ""),
+    "verify MEDIUM --workers 0": ("'0' is not a whole number from 1", ""),
+    "verify DISCRETE": ("actions must be a Box space, not Discrete(2)", ""),
+    "import-d4rl": ("the following arguments are required: FILE.hdf5, --id", ""),
+    "import-d4rl none.hdf5 --id x-v0": ("none.hdf5 is not a readable D4RL file", "No such file"),
+    "import-d4rl . --id x-v0": ("is not a readable D4RL file", ""),
+    "import-d4rl empty.safetensors --id x-v0": ("is not a readable D4RL file", ""),
+    "import-d4rl text.hdf5 --id x-v0": ("text.hdf5 is not a readable D4RL file", ""),
+    "import-d4rl hopper.hdf5 --id ../x-v0": ("is not a dataset id", ""),
+    "import-d4rl hopper.hdf5 --id x": ("'x' is not a dataset id", "-v0"),
+    "import-d4rl D4RL --id x-v0": ("cannot tell the environment of file.hdf5", "--env hopper"),
+    "import-d4rl D4RL --id x-v0 --env hoper": ("did you mean 'hopper'?", ""),
+    "import-d4rl D4RL --id x-v0 --env hopper": ("has observations (4,)", "give the right --env"),
+    "import-d4rl D4RL --id MEDIUM --env inverted-pendulum": ("tiny-medium-v0 exists already", "--overwrite"),
+    "export": ("the following arguments are required: ID, --out", ""),
+    "export x-v0 --out out.hdf5": ("unknown dataset 'x-v0'", ""),
+    "export MEDIUM --out out.hdf5 --format csv": ("invalid choice: 'csv'", ""),
+    "export MEDIUM --out out.hdf5 --drop-timeouts": ("--drop-timeouts goes with --format npz", ""),
+    "export MEDIUM --out .": ("cannot write", ""),
+    "export MEDIUM --out empty.safetensors/out.hdf5": ("cannot write", ""),
+    "export DISCRETE --out out.hdf5": ("must be a Box space", ""),
+    "export-policy nowhere --out policy.pt": ("no policy file nowhere", ""),
+    "export-policy . --out policy.pt": ("no policy file policy.safetensors", ""),
+    "export-policy empty.safetensors --out policy.pt": ("not a readable policy file", ""),
     "behaviour hoper": ("did you mean 'hopper'?", ""),
     "behaviour hopper --steps 12345": ("steps must be a multiple of 10000", ""),
 }
@@ -96,7 +126,17 @@ def prepared(medium: str, home: Path) -> dict[str, str]:
     foreign("discrete-v0", [episode(3, 0, True, **discrete)], actions=gym.spaces.Discrete(2))
     foreign("nan-v0", [episode(3, 0, True, rewards=np.array([0.0, np.nan, 1.0]))])
     (home / "empty.safetensors").touch()
-    return {"MEDIUM": medium, "DISCRETE": "discrete-v0", "NAN": "nan-v0", "MEDIM": "tiny-medum-v0"}
+    (home / "text.hdf5").write_text("text")
+    with h5py.File(home / "file.hdf5", "w") as file:
+        file["observations"], file["actions"] = np.zeros((9, 4)), np.zeros((9, 1))
+        file["rewards"], file["terminals"] = np.zeros(9), np.zeros(9, bool)
+    return {
+        "D4RL": "file.hdf5",
+        "MEDIUM": medium,
+        "DISCRETE": "discrete-v0",
+        "NAN": "nan-v0",
+        "MEDIM": "tiny-medum-v0",
+    }
 
 
 def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -119,6 +159,10 @@ def test_bad_words(typed: str, prepared: dict[str, str], capsys: pytest.CaptureF
     line = refusal([prepared.get(word, word) for word in typed.split()], capsys)
     for part in CASES[typed]:
         assert part in line
+
+
+def test_there_are_many() -> None:
+    assert len(CASES) + len(RECIPES) >= 60
 
 
 RECIPES: dict[str, tuple[str, str]] = {

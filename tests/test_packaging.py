@@ -42,7 +42,7 @@ def test_wheel_and_sdist_carry_recipes_weights_and_algorithms(built: Path) -> No
     for name in shipped():
         assert f"offbench/{name}" in in_wheel
         assert f"offbench/{name}" in in_sdist
-    for folder in ("assets", "published"):
+    for folder in ("grids", "reports/assets", "reports/published"):
         for path in (ROOT / "offbench" / folder).iterdir():
             assert f"offbench/{folder}/{path.name}" in in_wheel
             assert f"offbench/{folder}/{path.name}" in in_sdist

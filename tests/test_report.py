@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 import offbench
-from offbench import assess, reporting
+from offbench import assess, reports
 from offbench.cli import main
 from offbench.files import write_json
-from offbench.report_tables import published
+from offbench.reports.tables import published
 from offbench.results import Method, Task, read_results
 from tests.made_runs import METHODS, made_grid, made_run
 from tests.pages import Page, rows
@@ -274,7 +274,7 @@ def test_another_page_is_not_replaced(home: Path) -> None:
 
 
 def test_a_shipped_dataset_card_is_shown(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    package = Path(str(importlib.resources.files("offbench")))
+    package = Path(str(importlib.resources.files("offbench.reports")))
     shutil.copytree(package / "assets", home / "package" / "assets")
     shutil.copytree(package / "published", home / "package" / "published")
     values = {"transitions": 1000, "episodes": 7, "return": 12.3, "std": 4.5, "score": 33.3, "terminated": 0.25}
@@ -283,7 +283,7 @@ def test_a_shipped_dataset_card_is_shown(home: Path, monkeypatch: pytest.MonkeyP
     (home / "package" / "datasets" / "hopper" / "card.png").write_bytes(b"\x89PNG")
     made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
     made_run(home / "runs", "my-medium-v0", "td3_bc", "default", 0, 50)
-    monkeypatch.setattr(reporting.importlib.resources, "files", lambda _: home / "package")
+    monkeypatch.setattr(reports.importlib.resources, "files", lambda _: home / "package")
     page = Page(offbench.report(home / "runs", home / "out"))
     assert "hopper (mujoco 3.4.0)" in page.text
     assert "25.0%" in page.text

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import offbench
-from offbench.report_figures import shortened
+from offbench.reports.figures import shortened
 from tests.made_runs import METHODS, made_grid
 from tests.pages import HOSTILE, Page, hostile_runs
 

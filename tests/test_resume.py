@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -146,13 +147,19 @@ def test_a_finished_run_is_left_alone(medium: str) -> None:
     assert {path.name: path.stat().st_mtime_ns for path in run.folder.glob("*.safetensors")} == before
 
 
-def test_a_damaged_checkpoint_falls_back_to_the_one_before(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("damage", ["cut", "one bit"])
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(
+    damage: str, medium: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     (whole,) = train("td3_bc", medium, "whole", 300)
     (run,) = train("td3_bc", medium, "runs", 200)
     newest = run.folder / "checkpoint-000000200.safetensors"
-    newest.write_bytes(newest.read_bytes()[:1000])
+    data = bytearray(newest.read_bytes())
+    data[-100] ^= 1
+    newest.write_bytes(data if damage == "one bit" else data[:1000])
     train("td3_bc", medium, "runs", 300)
-    assert "is damaged" in capsys.readouterr().err
+    assert "checkpoint-000000200.safetensors is damaged" in (said := capsys.readouterr().err)
+    assert "using the one before it" in said
     assert run.policy_path.read_bytes() == whole.policy_path.read_bytes()
     assert run.evaluations_path.read_bytes() == whole.evaluations_path.read_bytes()
 
@@ -278,4 +285,4 @@ main(["train", "td3_bc", "--dataset", {medium!r}, "--steps", "200", "--eval-ever
     with held(run):
         found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=dict(os.environ))
     assert found.returncode == 2
-    assert "being trained by another process" in found.stderr
+    assert f"is being trained by process {os.getpid()} on {socket.gethostname()}" in found.stderr

@@ -57,10 +57,15 @@ def test_spread_over_seeds() -> None:
 
 def write_run(seed: int, returns: list[float], variant: str = "default", d4rl: Any = (-10.0, 190.0)) -> None:
     run = Run(Path("runs") / "x-v0" / "bdb" / variant / f"seed-{seed}")
-    config = {"format": "offbench-run-1", "dataset": "x-v0", "algorithm": "bdb", "variant": variant, "seed": seed}
+    config: dict[str, Any] = {
+        "format": "offbench-run-1",
+        "dataset": "x-v0",
+        "algorithm": "bdb",
+        "variant": variant,
+        "seed": seed,
+    }
     references = {"dataset": [0.0, 200.0], "d4rl": d4rl}
-    for key in ("settings", "dataset_sha256", "eval_every", "eval_episodes"):
-        config[key] = 0
+    config |= {"settings": {}, "dataset_sha256": "ab" * 32, "eval_every": 100, "eval_episodes": 3}
     run.folder.mkdir(parents=True)
     run.claim(config | {"references": references, "steps": 100})
     run.write_evaluations({100: [(value, 3) for value in returns]})

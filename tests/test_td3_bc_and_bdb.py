@@ -163,7 +163,7 @@ def test_the_discriminator_tells_data_from_policy_where_it_can() -> None:
         for batch, _ in batches(400):
             pi = algorithm.actor(batch.observations)[0].tanh().detach()
             batch = batch._replace(actions=torch.full_like(pi, 0.8) if apart else pi)
-            loss, logs = discriminator_loss(algorithm.discriminator, algorithm.actor, batch)
+            loss, logs = discriminator_loss(algorithm.discriminator, pi, batch)
             algorithm.discriminator.minimize(10 * loss.sum())
         if apart:
             assert logs["d_real"].item() > 0.9
@@ -195,7 +195,7 @@ def test_adaptive_beta_is_one_over_the_spread_of_the_critics() -> None:
     q = algorithm.critic(batch.observations, pi).squeeze(-1).detach()
     spread = (q[0] - q[1]).abs()
     assert spread.min() < 1 < spread.max()
-    parts = algorithm.actor, algorithm.critic, algorithm.discriminator, algorithm.learned_beta
+    parts = pi, algorithm.critic, algorithm.discriminator, algorithm.learned_beta
     expected = torch.where(spread < 1, torch.ones(()), 1 / spread)
     _, logs = actor_loss(*parts, batch, algorithm.config, False)
     torch.testing.assert_close(logs["beta"], expected.mean(-1))
@@ -241,7 +241,8 @@ def test_relative_uncertainty_does_not_change_with_the_size_of_q() -> None:
         with torch.no_grad():
             last = HIDDEN[-1] + 1  # the weights and bias of the last layer scale Q itself
             algorithm.critic.flat[..., -last:] *= factor
-        found.append(uncertainty(algorithm.critic, batch, batch.actions, algorithm.config))
+        q = algorithm.critic(batch.observations, batch.actions).squeeze(-1).detach()
+        found.append(uncertainty(q, algorithm.config))
     torch.testing.assert_close(found[0], found[1])
 
 

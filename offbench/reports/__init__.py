@@ -17,16 +17,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from offbench import report_figures as draw
-from offbench import report_tables as tables
 from offbench.errors import OffbenchError
 from offbench.files import read_json, write_bytes
-from offbench.layout import Cell, Table, files
-from offbench.markup import Markup, join, tag
-from offbench.report_figures import Figure, Line
-from offbench.report_page import Section, boxes, figures, page, relative, table
-from offbench.report_similarity import similarity_tables
-from offbench.report_tables import scale
+from offbench.reports import figures as draw
+from offbench.reports import tables
+from offbench.reports.figures import Figure, Line
+from offbench.reports.layout import Cell, Table, files
+from offbench.reports.markup import Markup, join, tag
+from offbench.reports.page import Section, boxes, figures, page, relative, table
+from offbench.reports.similarity import similarity_tables
+from offbench.reports.tables import scale
 from offbench.results import Entry, Method, Results, read_results
 
 PAGE = "index.html"

@@ -8,10 +8,10 @@ import importlib.resources
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from offbench.layout import Cell, Table
-from offbench.markup import Markup, breakable, join, tag
-from offbench.report_figures import Figure, Line
-from offbench.report_tables import cell_id
+from offbench.reports.figures import Figure, Line
+from offbench.reports.layout import Cell, Table
+from offbench.reports.markup import Markup, breakable, join, tag
+from offbench.reports.tables import cell_id
 from offbench.results import REFERENCES, Entry, Results, Trained
 from offbench.runs import Run
 from offbench.scores import run_return
@@ -53,7 +53,7 @@ def page(title: str, lead: Markup, sections: Sequence[Section], boxes: Sequence[
 
 
 def _asset(name: str) -> str:
-    return (importlib.resources.files("offbench") / "assets" / name).read_text(encoding="utf-8")
+    return (importlib.resources.files("offbench.reports") / "assets" / name).read_text(encoding="utf-8")
 
 
 def _section(section: Section) -> Markup:

@@ -7,8 +7,8 @@ from typing import Any
 
 from offbench.errors import OffbenchError
 from offbench.files import read_json
-from offbench.layout import Cell, Table
-from offbench.report_tables import NONE, plus_minus, published
+from offbench.reports.layout import Cell, Table
+from offbench.reports.tables import NONE, plus_minus, published
 from offbench.results import Entry, Method, Results, Task
 from offbench.scores import mean_std
 

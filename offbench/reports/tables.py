@@ -7,7 +7,7 @@ import dataclasses
 import importlib.resources
 from collections.abc import Mapping, Sequence
 
-from offbench.layout import Cell, Table
+from offbench.reports.layout import Cell, Table
 from offbench.results import REFERENCES, Entry, Method, Results
 from offbench.scores import LAST, mean_std
 from offbench.statistics import Estimate, Scores, improvement, iqm
@@ -23,7 +23,7 @@ DIFFERENT_DATA = (
 
 def published(name: str) -> list[dict[str, str]]:
     """Return the rows of a shipped table of published numbers: `scores` or `similarity`."""
-    path = importlib.resources.files("offbench") / "published" / f"{name}.csv"
+    path = importlib.resources.files("offbench.reports") / "published" / f"{name}.csv"
     return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
 

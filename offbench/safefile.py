@@ -1,0 +1,88 @@
+"""HDF5 on a disk that may be full: libhdf5 crashes the whole process when a write fails while it closes a file."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+
+class SafeFile:
+    """A file that libhdf5 writes to without ever meeting an error.
+
+    The first error is kept and everything after it is dropped; `check` raises it. Whoever writes calls `check` now
+    and then, and at the end. It has what h5py asks of a file object.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by `close`)
+        self._error: OSError | None = None
+
+    def check(self) -> None:
+        """Raise the error that a write met, if one did."""
+        if self._error is not None:
+            raise self._error
+
+    def write(self, data: Any) -> int:
+        """Write, or keep the error."""
+        view = memoryview(data).cast("B")
+        done = 0
+        while done < len(view) and self._error is None:
+            try:
+                done += self._file.write(view[done:])
+            except OSError as error:
+                self._error = error
+        return len(view)
+
+    def readinto(self, buffer: Any) -> int:
+        """Read; what a failed write left out is zeros."""
+        view = memoryview(buffer).cast("B")
+        count = self._file.readinto(view) or 0
+        view[count:] = bytes(len(view) - count)
+        return len(view)
+
+    def read(self, size: int) -> bytes:
+        """Read `size` bytes."""
+        data = bytearray(size)
+        self.readinto(data)
+        return bytes(data)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Move as any file does."""
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        """Return the position."""
+        return self._file.tell()
+
+    def truncate(self, size: int) -> int:
+        """Set the size, or keep the error."""
+        try:
+            self._file.truncate(size)
+        except OSError as error:
+            self._error = self._error or error
+        return size
+
+    def flush(self) -> None:
+        """Do nothing: nothing is buffered."""
+
+    def close(self) -> None:
+        """Close; the data are on the disk, or the error is raised."""
+        with self._file:
+            self.check()
+            os.fsync(self._file.fileno())
+
+
+@contextlib.contextmanager
+def safe_file(path: Path) -> Iterator[SafeFile]:
+    """Open a new file for libhdf5. Raises OSError at the end if a write failed."""
+    file = SafeFile(path)
+    try:
+        yield file
+    except BaseException:
+        with contextlib.suppress(OSError):
+            file.close()
+        raise
+    file.close()

@@ -1,0 +1,182 @@
+"""`verify`: is a dataset what it says? Its episodes, its metadata against them, and a sample of them played again.
+
+survey        one pass over every episode: shapes, ends, numbers, bounds, twins, seeds, content hash
+metadata      parts, levels and their returns, as offbench recorded them
+resimulate    a sample of episodes played again in the environment
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from offbench import dataset, seeds
+from offbench.claims import check_claims
+from offbench.environments import believed_env, box
+from offbench.errors import OffbenchError
+from offbench.findings import Findings, Report
+from offbench.provenance import versions
+from offbench.resimulate import Verdict, check
+from offbench.rollout import Rollouts, result
+from offbench.seeds import Purpose
+from offbench.survey import Survey, episodes_of, survey
+from offbench.workers import default_workers
+
+EPISODES = 300  # played again by default: half a minute for a million transitions
+FEW = 20_000  # steps to play again that are not worth worker processes
+
+
+def verify(dataset_id: str, *, episodes: int | None = None, workers: int | None = None) -> Report:
+    """Check a local Minari dataset with flat Box spaces, whoever made it.
+
+    Args:
+        dataset_id: its id.
+        episodes: how many are played again in the environment, where that is possible (default: 300).
+        workers: processes for it (default: one a core).
+
+    Returns:
+        The report; `report.ok` is False if something is off. Damaged data are findings, not errors.
+
+    Raises:
+        OffbenchError: no such dataset, or spaces other than flat Boxes.
+    """
+    from offbench.transitions import open_minari  # here, because `verify --help` need not wait for Minari
+
+    report, findings = Report(dataset_id), Findings()
+    if not dataset.exists(dataset_id):
+        dataset.read_metadata(dataset_id)  # raises, and names the nearest id
+    workers, episodes = default_workers(workers), EPISODES if episodes is None else episodes
+    code = "metadata"
+    try:
+        metadata = dataset.read_metadata(dataset_id)
+        code = "unreadable"
+        data = open_minari(dataset_id)
+    except OffbenchError as error:
+        findings.add(code, dataset_id, str(error))
+        return dataclasses.replace(report, findings=findings.all())
+    box(data.observation_space, f"{dataset_id}: observations")
+    box(data.action_space, f"{dataset_id}: actions")
+    spec = metadata.get("env_spec")
+    try:
+        found = survey(data, _limit(spec), findings)
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, AssertionError) as error:
+        findings.add("unreadable", dataset_id, str(error))
+        return dataclasses.replace(report, findings=findings.all())
+    report.transitions, report.episodes = found.steps, len(found.lengths)
+    report.checked.append("every episode: shapes, types, ends, finite numbers, bounds, duplicates, seeds")
+    _counts(metadata, dataset_id, found, findings)
+    last = check_claims(dataset.provenance(metadata), found, _limit(spec), report, findings)
+    chosen = _choose(found, _limit(spec), last, episodes)
+    _play(data, chosen, found, metadata, workers, report, findings)
+    report.findings = findings.all()
+    return report
+
+
+def _limit(spec: str | None) -> int | None:
+    """Return the time limit that an EnvSpec (JSON) names, if it does."""
+    try:
+        limit = json.loads(spec or "null")["max_episode_steps"]
+    except (TypeError, KeyError, ValueError):
+        return None
+    return limit if isinstance(limit, int) and limit > 0 else None
+
+
+def _counts(metadata: dict[str, Any], dataset_id: str, found: Survey, findings: Findings) -> None:
+    for key, count in (("total_steps", found.steps), ("total_episodes", len(found.lengths))):
+        if metadata.get(key) != count:
+            findings.add("counts", "metadata", f"{key} is {metadata.get(key)}, the data have {count}")
+    if metadata.get("dataset_id") != dataset_id:
+        findings.add("metadata", "metadata", f"it calls itself {metadata.get('dataset_id')!r}")
+
+
+def _play(
+    data: Any,
+    chosen: Sequence[int],
+    found: Survey,
+    metadata: dict[str, Any],
+    workers: int,
+    report: Report,
+    findings: Findings,
+) -> None:
+    """Play the chosen episodes again, by the strictest means that each allows."""
+    spec = metadata.get("env_spec")
+    if not spec:
+        report.skipped.append("playing episodes again: the dataset names no environment")
+        return
+    if not chosen or not _same_spaces(spec, data, report, findings):
+        return
+    made, here = _recorded_mujoco(metadata), versions()["mujoco"]
+    exact = made == here
+    if made is not None and not exact:
+        report.warnings.append(f"recorded with mujoco {made}, installed is {here}: compared within a tolerance")
+    last_unknown = dataset.provenance(metadata).get("final_observations") == "repeated"
+    steps = sum(found.lengths[i] for i in chosen)
+    with Rollouts(spec, workers if workers > 1 and steps > FEW else 0) as rollouts:
+        names = [int(data.episode_indices[i]) for i in chosen]
+        jobs = [
+            rollouts.call(check, spec, e, exact, last_unknown and bool(e.terminations[-1]))
+            for e in episodes_of(data, names)
+        ]
+        verdicts: list[Verdict] = [result(job) for job in jobs]
+    _tell(verdicts, made if exact else None, report, findings)
+
+
+def _same_spaces(spec: str, data: Any, report: Report, findings: Findings) -> bool:
+    """Return whether the environment can be made and has the dataset's spaces; say what hinders it."""
+    try:
+        env = believed_env(spec, "playing episodes again")
+    except OffbenchError as error:
+        report.skipped.append(str(error))
+        return False
+    theirs: Any = env.action_space
+    same = env.observation_space.shape == data.observation_space.shape and theirs.shape == data.action_space.shape
+    same = same and bool((theirs.low == data.action_space.low).all() and (theirs.high == data.action_space.high).all())
+    env.close()
+    if not same:
+        findings.add("other-spaces", "metadata", f"{env.observation_space} and {theirs}")
+    return same
+
+
+def _recorded_mujoco(metadata: dict[str, Any]) -> str | None:
+    """Return the MuJoCo version a dataset was recorded with: ours, or what a requirement pins; None if unknown."""
+    made = dataset.provenance(metadata).get("versions")
+    if isinstance(made, dict) and "mujoco" in made:
+        return str(made["mujoco"])
+    listed = metadata.get("requirements")
+    for requirement in listed if isinstance(listed, list) else []:
+        pinned = re.fullmatch(r"mujoco\s*==\s*([\w.]+)", str(requirement))
+        if pinned:
+            return pinned[1]
+    return None
+
+
+def _choose(found: Survey, limit: int | None, last: Sequence[int], episodes: int) -> list[int]:
+    """Return the episodes to play again: a random sample, the last of each part, and those that end at the limit."""
+    sound = [i for i, good in enumerate(found.sound) if good]
+    if not sound or episodes < 1:
+        return []
+    rng = seeds.generator(0, Purpose.SAMPLE)
+    sample = rng.choice(sound, min(episodes, len(sound)), replace=False).tolist()
+    suspects = [i for i in sound if found.lengths[i] == limit and found.ended[i][0]][:episodes]
+    return sorted({*sample, *suspects, *(i for i in last if found.sound[i])})
+
+
+def _tell(verdicts: Sequence[Verdict], mujoco: str | None, report: Report, findings: Findings) -> None:
+    ways = {
+        "seed": f"from their seeds, {f'bit for bit (mujoco {mujoco})' if mujoco else 'within a tolerance'}",
+        "step": "one step at a time from recorded states",
+    }
+    for how, words in ways.items():
+        played = [verdict for verdict in verdicts if verdict.how == how]
+        if played:
+            steps = sum(verdict.steps for verdict in played)
+            report.checked.append(f"{len(played):,} episodes played again {words}: {steps:,} steps")
+    left = sum(verdict.how == "none" for verdict in verdicts)
+    if left:
+        report.skipped.append(f"playing {left:,} episodes again: no seed, and no state to be set from observations")
+    for verdict in verdicts:
+        for code, detail in verdict.faults:
+            findings.add(code, f"episode {verdict.index}", detail)

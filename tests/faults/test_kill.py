@@ -1,0 +1,230 @@
+"""kill -9 at random moments: nothing half-written is ever seen, and the same command ends as if undisturbed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import offbench
+from offbench import checkpoints, dataset
+from offbench.exports import export
+from offbench.policy import load_policy
+from offbench.runs import Run, find_runs
+from offbench.survey import episodes_of
+from offbench.transitions import open_minari
+from tests.conftest import ROOT
+
+KILLS = {"collect": 80, "overwrite": 60, "import": 40, "train": 100}  # at least 200 over collect and train
+RUN = ["--steps", "160", "--eval-every", "40", "--eval-episodes", "1", "--hidden", "16,16", "--batch-size", "16"]
+
+
+class Warm:
+    """Runs commands in forks of a warmed-up process."""
+
+    def __init__(self) -> None:
+        environment = dict(os.environ) | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "tests.faults.warm"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+            cwd=ROOT,
+        )
+
+    def run(self, words: list[str], folder: Path, kill_after: float | None = None) -> dict[str, Any]:
+        """Run one command in `folder`, with datasets and cache below it; kill it after so many seconds."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        environment = {"MINARI_DATASETS_PATH": str(folder / "minari"), "OFFBENCH_CACHE": str(folder / "cache")}
+        command = {"words": words, "environment": environment, "folder": str(folder), "kill_after": kill_after}
+        self.process.stdin.write(json.dumps(command) + "\n")
+        self.process.stdin.flush()
+        answer: dict[str, Any] = json.loads(self.process.stdout.readline())
+        assert "Traceback" not in answer["stderr"], answer["stderr"]
+        return answer
+
+    def close(self) -> None:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.close()
+        assert self.process.wait(timeout=60) == 0
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def warm() -> Iterator[Warm]:
+    process = Warm()
+    yield process
+    process.close()
+
+
+def whole(name: str) -> str:
+    """Read a visible dataset to its end; return its content hash, which is the recorded one."""
+    content = dataset.ContentHash()
+    for e in episodes_of(open_minari(name)):
+        content.add(e.observations, e.actions, e.rewards, (bool(e.terminations[-1]), bool(e.truncations[-1])))
+    assert content.hexdigest() == dataset.provenance(dataset.read_metadata(name))["content_sha256"]
+    return content.hexdigest()
+
+
+def facts(name: str) -> dict[str, Any]:
+    return {key: value for key, value in dataset.read_metadata(name).items() if key != "dataset_size"}
+
+
+Check = Callable[[Path], object]
+
+
+def trials(
+    warm: Warm, words: list[str], kind: str, home: Path, patch: pytest.MonkeyPatch, prepare: Check, look: Check
+) -> None:
+    """Kill a command at moments spread over its whole duration until it was killed often enough.
+
+    For each trial: `prepare` its folder (datasets and cache are below it), run and kill, `look` at what is there.
+    """
+    rng = np.random.default_rng(len(kind))
+    kills, trial, seconds = 0, 0, 0.0
+    while kills < KILLS[kind]:
+        trial += 1
+        assert trial < 4 * KILLS[kind] + 10, "the command is too short to be killed"
+        folder = home / f"{kind}-{trial}"
+        folder.mkdir()
+        patch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
+        patch.setenv("OFFBENCH_CACHE", str(folder / "cache"))
+        prepare(folder)
+        if not seconds:  # how long it takes, undisturbed
+            answer = warm.run(words, folder)
+            assert answer["status"] == 0, answer["stderr"]
+            seconds = answer["seconds"]
+        else:
+            kills += warm.run(words, folder, rng.uniform(0, seconds))["status"] == -9
+        look(folder)
+        shutil.rmtree(folder)
+    print(f"{kind}: {kills} kills in {trial} trials of up to {seconds:.2f} s")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["collect", "overwrite"])
+def test_collect_survives_kill_9(
+    kind: str, tiny: tuple[str, str], home: Path, warm: Warm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new id is absent or whole; one that is replaced is the old dataset or the new one. Then it is the new one."""
+    words = ["collect", tiny[0], "--behaviour-dir", tiny[1], "--workers", "1", "--steps", "600"]
+    name, again = "tiny-medium-v0", [*words, "--overwrite"]
+    undisturbed = home / "undisturbed"
+    undisturbed.mkdir()
+    assert warm.run(words, undisturbed)["status"] == 0
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(undisturbed / "minari"))
+    right, known = whole(name), facts(name)
+    old: list[str] = []
+
+    def prepare(folder: Path) -> None:
+        if kind == "overwrite":
+            assert warm.run([*words[:-2], "--seed", "7"], folder)["status"] == 0
+            old.append(whole(name))
+
+    def look(folder: Path) -> None:
+        seen = dataset.local_ids()
+        content = whole(name) if seen else None
+        assert seen in ([], [name])
+        assert content in (right, old[-1] if kind == "overwrite" else None)
+        answer = warm.run(again if kind == "overwrite" else words, folder)
+        assert answer["status"] == 0 or (content == right and "exists already" in answer["stderr"])
+        assert whole(name) == right
+        assert facts(name) == known
+        assert [p.name for p in dataset.root().iterdir() if not p.name.endswith(".lock")] == [name]
+
+    trials(warm, again if kind == "overwrite" else words, kind, home, monkeypatch, prepare, look)
+
+
+@pytest.mark.slow
+def test_import_survives_kill_9(medium: str, home: Path, warm: Warm, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, right = export(medium, home / "out.hdf5"), whole(medium)
+    words = ["import-d4rl", str(file), "--id", "back-v0"]
+
+    def look(folder: Path) -> None:
+        seen = dataset.local_ids()
+        assert seen in ([], ["back-v0"])
+        answer = warm.run(words, folder)
+        assert answer["status"] == 0 or (seen and "exists already" in answer["stderr"])
+        assert whole("back-v0") == right
+
+    trials(warm, words, "import", home, monkeypatch, lambda _: None, look)
+
+
+@pytest.mark.slow
+def test_training_survives_kill_9_at_any_moment(
+    medium: str, home: Path, warm: Warm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed, then left alone: every file that counts has the undisturbed run's bytes."""
+    words = ["train", "td3_bc", "--dataset", medium, *RUN]
+    minari = home / "minari"
+    undisturbed = home / "undisturbed"
+
+    def prepare(folder: Path) -> None:
+        folder.mkdir(exist_ok=True)
+        (folder / "minari").symlink_to(minari)
+
+    prepare(undisturbed)
+    assert warm.run(words, undisturbed)["status"] == 0
+    (right,) = find_runs(undisturbed / "runs")
+    names = ("evaluations.csv", "losses.csv", "policy.safetensors", "checkpoint-000000160.safetensors")
+    wanted = {name: (right.folder / name).read_bytes() for name in names}
+    last: list[int] = []
+
+    def look(folder: Path) -> None:
+        for run in find_runs(folder / "runs"):
+            last.append(sound(run))
+        assert warm.run(words, folder)["status"] == 0
+        (run,) = find_runs(folder / "runs")
+        assert {name: (run.folder / name).read_bytes() for name in names} == wanted
+        assert run.config()["dataset_sha256"] == right.config()["dataset_sha256"]
+
+    trials(warm, words, "train", home, monkeypatch, prepare, look)
+    assert {0, 40, 80} <= set(last)  # killed early and late
+
+
+def sound(run: Run) -> int:
+    """Check that every visible file of a killed run is whole; return its newest checkpoint's step."""
+    run.config()
+    run.evaluations()
+    run.losses()
+    if run.policy_path.exists():
+        load_policy(run.policy_path)
+    steps = checkpoints.steps(run.folder)
+    assert all(checkpoints.load_checkpoint(run.folder, step) for step in steps)
+    return max(steps, default=0)
+
+
+@pytest.mark.slow
+def test_two_recordings_of_one_id_at_the_same_time(tiny: tuple[str, str], home: Path) -> None:
+    """Real processes, started together: one records, the other names it or finds the dataset there."""
+    words = ["collect", tiny[0], "--behaviour-dir", tiny[1], "--workers", "1", "--steps", "30000"]
+    command = [sys.executable, "-m", "offbench", *words]
+    both = [subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) for _ in range(2)]
+    said = {process.pid: process.communicate(timeout=300)[1] for process in both}
+    assert sorted(process.returncode for process in both) == [0, 2]
+    winner, loser = sorted(both, key=lambda process: process.returncode)
+    assert f"is being recorded by process {winner.pid} on " in said[loser.pid] or "exists already" in said[loser.pid]
+    whole("tiny-medium-v0")
+
+
+def test_the_holder_of_an_id_is_named(medium: str, tiny: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    import socket
+
+    with dataset.claimed("new-v0", False):
+        command = [sys.executable, "-m", "offbench", "collect", tiny[0], "--id", "new-v0"]
+        found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert found.returncode == 2
+    assert f"new-v0 is being recorded by process {os.getpid()} on {socket.gethostname()}" in found.stderr
+    assert offbench.show(medium).returns.size
+    assert [p.name for p in dataset.root().iterdir() if not p.name.endswith(".lock")] == [medium]
