@@ -5,7 +5,7 @@ set -eu
 BIN=${BIN:-.venv/bin}
 for env in "${@:-hopper}"; do
     film="--seconds 4 --fps 20 --size 200"
-    "$BIN/offbench" video "$env:random" --out "docs/media/$env-random.gif" $film --episodes 12
+    "$BIN/offbench" video "$env:random" --out "docs/media/$env-random.gif" $film --episodes 99
     "$BIN/offbench" video "$env:medium" --out "docs/media/$env-medium.gif" $film
     "$BIN/offbench" video "$env:expert" --out "docs/media/$env-expert.gif" $film
 done

@@ -15,7 +15,7 @@ def video_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--out", default="video.mp4", metavar="FILE", help=".mp4 or .gif (default: video.mp4)")
     parser.add_argument("--env", help="a recipe, instead of the environment the policy names")
     parser.add_argument("--episodes", type=whole, default=1, help="default: 1")
-    parser.add_argument("--seconds", type=number, help="length of an episode at most (default: whole)")
+    parser.add_argument("--seconds", type=number, help="length of the film at most (default: whole episodes)")
     parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
     parser.add_argument("--fps", type=whole, default=25, help="frames a second (default: 25)")
     parser.add_argument("--size", type=whole, default=480, help="longer side in pixels (default: 480)")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,7 +57,7 @@ def video(
         out: the film's file, .mp4 or .gif.
         env: a recipe, instead of the environment that the run or policy names.
         episodes: how many, one after the other.
-        seconds: length of each at most (default: whole episodes).
+        seconds: length of the film at most (default: whole episodes).
         seed: of the episodes.
         fps: frames a second, about: films run in real time, and show whole steps.
         size: the longer side in pixels.
@@ -79,11 +79,8 @@ def video(
     with drawing_with(backend), _drawable(spec, backend) as world:
         rate = float(world.metadata.get("render_fps") or fps)
         every = max(1, round(rate / fps))
-        frames: Iterator[Image] = (
-            frame
-            for episode in range(episodes)
-            for frame in _episode(world, policy, (seed, episode), sampled, every, seconds and seconds * rate, size)
-        )
+        most = seconds * rate if seconds else float("inf")
+        frames = _episodes(world, policy, (seed, episodes), sampled, every, most, size)
         encode(target, frames, rate / every)
     return target
 
@@ -130,16 +127,32 @@ def _drawable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
     return env
 
 
+def _episodes(
+    env: gym.Env[Any, Any],
+    policy: Policy,
+    seed_and_count: tuple[int, int],
+    sampled: bool,
+    every: int,
+    most: float,
+    size: int,
+) -> Iterator[Image]:
+    """Yield the frames of episode after episode, of `most` steps together."""
+    seed, count = seed_and_count
+    for episode in range(count):
+        if most > 0:
+            most -= yield from _episode(env, policy, (seed, episode), sampled, every, most, size)
+
+
 def _episode(
     env: gym.Env[Any, Any],
     policy: Policy,
     which: tuple[int, int],
     sampled: bool,
     every: int,
-    limit: float | None,
+    most: float,
     size: int,
-) -> Iterator[Image]:
-    """Play one episode; yield every so many steps a frame, and the last."""
+) -> Generator[Image, None, int]:
+    """Play one episode; yield every so many steps a frame, and the last; return its steps."""
     seed, index = which
     rng = seeds.generator(seed, Purpose.ACTION, *STREAM, index)
     noisy = policy.needs_noise(not sampled)
@@ -150,9 +163,10 @@ def _episode(
         noise = policy.draw(rng, 1) if noisy else None
         observation, reward, terminated, truncated, _ = env.step(policy.act(np.asarray(observation)[None], noise)[0])
         step, total = step + 1, total + float(reward)
-        over = bool(terminated or truncated or (limit is not None and step >= limit))
+        over = bool(terminated or truncated or step >= most)
         if over or step % every == 0:
             yield _frame(env, step, total, size)
+    return step
 
 
 def _frame(env: gym.Env[Any, Any], step: int, total: float, size: int) -> Image:

@@ -52,10 +52,10 @@ def test_a_gif_shows_the_episode_with_step_and_return(offbench_cli: Cli, home: P
 @pytest.mark.usefixtures("draws")
 def test_an_mp4_is_a_film_of_its_frames(home: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed: no mp4 was made")
-    made = video.video("inverted-pendulum:expert", out="film.mp4", episodes=2, seconds=0.4, fps=25, size=96)
+    made = video.video("inverted-pendulum:expert", out="film.mp4", episodes=2, seconds=0.8, fps=25, size=96)
     frames, seconds = ffmpeg.count_frames_and_secs(str(made))
-    assert frames == 22  # two episodes of 10 steps, and their first frames
-    assert seconds == pytest.approx(22 / 25, abs=0.05)
+    assert frames == 21  # 20 steps and the first frame: --seconds counts for the whole film
+    assert seconds == pytest.approx(21 / 25, abs=0.05)
 
 
 @pytest.mark.usefixtures("draws")
