@@ -53,7 +53,7 @@ def card(env: str, out: str | Path | None = None) -> Path:
         raise OffbenchError(f"{recipe.name} has no shipped ladder to describe; build one with `offbench behaviour`")
     levels = {level: _recorded(recipe, ladder, level) for level in LEVELS}
     facts = {level: _facts(recipe, summary) for level, summary in levels.items()}
-    means = [facts[level]["return"] for level in ("random", "medium-replay", "medium", "medium-expert", "expert")]
+    means = [facts[level]["return"] for level in LEVELS]
     if sorted(means) != means:
         print(f"offbench: warning: the levels of {recipe.name} are out of order: {means}", file=sys.stderr)
     folder = Path(out or f"{recipe.name}-card")
@@ -117,7 +117,7 @@ def _facts(recipe: Recipe, found: Summary) -> dict[str, Any]:
         "std": round(float(returns.std()), 2),
         "min": round(float(returns.min()), 2),
         "max": round(float(returns.max()), 2),
-        "score": round(normalize(mean, float(meta["ref_min_score"]), float(meta["ref_max_score"])), 2),
+        "score": round(normalize(mean, float(meta["ref_min_score"]), float(meta["ref_max_score"])), 2) + 0.0,  # no -0
         "d4rl_score": d4rl,
         "terminated": round(found.terminated, 4),
         "content_sha256": dataset.provenance(meta)["content_sha256"],
@@ -169,16 +169,18 @@ def _text(recipe: Recipe, ladder: Ladder, facts: Mapping[str, Any], made: Mappin
 
 
 def _cells(level: str, values: Mapping[str, Any]) -> list[str]:
-    d4rl = "-" if values["d4rl_score"] is None else f"{values['d4rl_score']:.1f}"
-    spread = [f"{values[key]:,.1f}" for key in ("return", "std", "min", "max", "score")]
+    spread = [_short(values[key]) for key in ("return", "std", "min", "max", "score", "d4rl_score")]
     return [
         level,
         f"{values['transitions']:,}",
         f"{values['episodes']:,}",
         *spread,
-        d4rl,
         f"{100 * values['terminated']:.1f}%",
     ]
+
+
+def _short(value: float | None) -> str:
+    return "-" if value is None else f"{round(value, 1) + 0.0:,.1f}"  # + 0.0: no -0.0
 
 
 def _draw(recipe: Recipe, ladder: Ladder, levels: Mapping[str, Summary], path: Path) -> None:

@@ -22,10 +22,10 @@ class Part:
     weight: float = 1.0
 
 
-LEVELS: dict[str, tuple[Part, ...]] = {
+LEVELS: dict[str, tuple[Part, ...]] = {  # in order of their mean return
     "random": (Part("uniform"),),
-    "medium": (Part("medium"),),
     "medium-replay": (Part("replay"),),
+    "medium": (Part("medium"),),
     "medium-expert": (Part("medium"), Part("expert")),
     "expert": (Part("expert"),),
 }

@@ -23,8 +23,7 @@ from offbench.levels import LEVELS
 from offbench.runs import Run, find_runs
 from offbench.scores import LAST, mean_std, normalize, run_return
 
-# the order of the BDB paper's Table 1
-LEVEL_ORDER = ("random", "medium-replay", "medium", "medium-expert", "expert")
+# the order of the BDB paper's Table 1; levels are in its order already
 ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
 METHOD_ORDER = ("td3_bc", "cql", "bdb")
 REFERENCES = {"dataset": "own reference", "d4rl": "D4RL's constants", None: "no reference: raw return"}
@@ -264,7 +263,7 @@ def _rank(name: str, order: Sequence[str]) -> tuple[int, str]:
 
 def _task_order(task: Task) -> tuple[Any, ...]:
     env, level = task.place
-    return _rank(level, LEVEL_ORDER), _rank(env, ENV_ORDER), task.dataset, task.content
+    return _rank(level, tuple(LEVELS)), _rank(env, ENV_ORDER), task.dataset, task.content
 
 
 def _method_order(method: Method) -> tuple[Any, ...]:
