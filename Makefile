@@ -35,5 +35,10 @@ bench: $(STAMP) .venv-d3rlpy/bin/python
 	grep -E "^(torch|numpy)==" constraints.txt > .venv-d3rlpy/pins.txt
 	.venv-d3rlpy/bin/python -m pip install -q -c .venv-d3rlpy/pins.txt d3rlpy==2.8.1
 
+# The site of docs/, into site/; a broken link or a page left out of the contents stops it.
+docs: $(STAMP)
+	$(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) .venv-d3rlpy build dist *.egg-info demo
+	rm -rf $(VENV) .venv-d3rlpy build dist *.egg-info demo site

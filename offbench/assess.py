@@ -75,16 +75,7 @@ def evaluate(
     if episodes < 1:
         raise OffbenchError(f"episodes must be at least 1, not {episodes}")
     path = Path(path)
-    config: Mapping[str, Any] = {}
-    if path.is_dir():
-        run = Run(path)
-        config = run.config()
-        if not run.policy_path.exists():
-            raise OffbenchError(f"{path} has no policy yet; train it to its first checkpoint")
-        policy = load_policy(run.policy_path)
-    else:
-        policy = load_policy(path)
-    spec = _spec(path, policy, config, env)
+    policy, config, spec = open_policy(path, env)
     if stochastic and not policy.stochastic:
         raise OffbenchError(f"{path} cannot sample its actions; leave out --stochastic")
     workers = default_workers(workers)
@@ -159,8 +150,24 @@ def similarity(
     return found
 
 
-def _spec(path: Path, policy: Policy, config: Mapping[str, Any], env: str | None) -> str:
-    """Return the environment to play in, checked to fit the policy."""
+def open_policy(path: Path, env: str | None = None) -> tuple[Policy, Mapping[str, Any], str]:
+    """Return the policy of a run's directory or a policy file, the run's config ({} for a file) and its EnvSpec.
+
+    Args:
+        env: a recipe's name or file, instead of the environment that the run or policy names.
+
+    Raises:
+        OffbenchError: no run or policy there, or it does not fit the environment.
+    """
+    config: Mapping[str, Any] = {}
+    if path.is_dir():
+        run = Run(path)
+        config = run.config()
+        if not run.policy_path.exists():
+            raise OffbenchError(f"{path} has no policy yet; train it to its first checkpoint")
+        policy = load_policy(run.policy_path)
+    else:
+        policy = load_policy(path)
     if env is not None:
         text = load_recipe(env).env_spec()
     elif isinstance(config.get("env_spec"), str):
@@ -169,4 +176,4 @@ def _spec(path: Path, policy: Policy, config: Mapping[str, Any], env: str | None
         text = env_spec(policy.env_id)
     else:
         raise OffbenchError(f"{path} names no environment; give one with --env")
-    return checked_spec(text, str(path), len(policy.observation_mean), len(policy.low))
+    return policy, config, checked_spec(text, str(path), len(policy.observation_mean), len(policy.low))

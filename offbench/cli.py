@@ -7,9 +7,10 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from json import dumps
+from pathlib import Path
 from typing import Any
 
-from offbench import travel
+from offbench import aids, travel
 from offbench.arguments import Parser, auto, natural, number, seed_list, share, whole
 from offbench.errors import OffbenchError, unknown
 
@@ -29,6 +30,9 @@ COMMANDS = {
     "export": "write a dataset as a D4RL file, or as arrays (npz)",
     "export-policy": "write a run's policy as TorchScript",
     "card": "write an environment's dataset card from its five recorded levels",
+    "video": "film a run's policy, a policy file, or a level such as hopper:medium",
+    "doctor": "what a bug report needs: versions, physics, machine, paths; exit code 1 if something is broken",
+    "completion": "print a shell's completion of these commands",
 }
 SWITCHES = ("--tf32", "--tensorboard")  # flags of `train` without a value: the algorithm may follow them
 
@@ -210,7 +214,8 @@ def _benchmark(parser: Parser, words: list[str]) -> None:
             where = RayExecutor(address)
             arguments["workers"] = arguments["workers"] or where.cpus
         finished = benchmark.benchmark(**arguments, budget=budget, shard=shard, executor=where, command=command)
-        print(tables.render(tables.score_runs(arguments["runs"])))
+        if any(Path(arguments["runs"]).rglob("evaluations.csv")):  # a small budget ends before there are any
+            print(tables.render(tables.score_runs(arguments["runs"])))
         if not finished:
             print("stopped at the budget; the same command goes on", file=sys.stderr)
 
@@ -348,4 +353,7 @@ ADD: dict[str, Callable[[Parser, list[str]], None]] = {
     "export": travel.export_arguments,
     "export-policy": travel.export_policy_arguments,
     "card": _card,
+    "video": aids.video_arguments,
+    "doctor": aids.doctor_arguments,
+    "completion": aids.completion_arguments,
 }

@@ -115,6 +115,11 @@ def test_a_budget_stops_cleanly_and_the_same_call_goes_on(grid: str) -> None:
     assert benchmark.benchmark(grid, workers=1, budget="1h", say=silent)
 
 
+def test_a_budget_that_ends_before_any_evaluation_is_no_error(grid: str, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["benchmark", grid, "--budget", "0.001s", "--workers", "1"])
+    assert "the same command goes on" in capsys.readouterr().err
+
+
 def test_shards_share_the_runs_and_together_are_the_grid(grid: str, home: Path) -> None:
     benchmark.benchmark(grid, workers=1, say=silent, runs="whole", stack=1)
     for place in range(3):

@@ -1,0 +1,61 @@
+"""The commands that help with a machine: `video`, `doctor` and `completion`. Parse, call, print."""
+
+from __future__ import annotations
+
+import sys
+from json import dumps
+from typing import Any
+
+from offbench.arguments import Parser, natural, number, whole
+
+
+def video_arguments(parser: Parser, _: list[str]) -> None:
+    """Add the arguments of `video`."""
+    parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run, a policy file, or ENV:LEVEL (hopper:medium)")
+    parser.add_argument("--out", default="video.mp4", metavar="FILE", help=".mp4 or .gif (default: video.mp4)")
+    parser.add_argument("--env", help="a recipe, instead of the environment the policy names")
+    parser.add_argument("--episodes", type=whole, default=1, help="default: 1")
+    parser.add_argument("--seconds", type=number, help="length of the film at most (default: whole episodes)")
+    parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
+    parser.add_argument("--fps", type=whole, default=25, help="frames a second (default: 25)")
+    parser.add_argument("--size", type=whole, default=480, help="longer side in pixels (default: 480)")
+
+    def run(**arguments: Any) -> None:
+        from offbench.video import video
+
+        print(f"film in {video(**arguments)}")
+
+    parser.set_defaults(run=run)
+
+
+def doctor_arguments(parser: Parser, _: list[str]) -> None:
+    """Add the arguments of `doctor`."""
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+    def run(json: bool) -> None:
+        from offbench.doctor import BROKEN, as_json, doctor
+
+        found = doctor()
+        print(dumps(as_json(found), indent=1) if json else "\n".join(map(str, found)))
+        sys.exit(any(finding.state == BROKEN for finding in found))
+
+    parser.set_defaults(run=run)
+
+
+def completion_arguments(parser: Parser, _: list[str]) -> None:
+    """Add the arguments of `completion`."""
+    from offbench.completion import SHELLS, script
+
+    parser.add_argument("shell", choices=SHELLS)
+
+    def run(shell: str) -> None:
+        from offbench import cli  # it knows all commands, this one too
+
+        def fill(words: list[str]) -> Parser:
+            sub = Parser(prog="offbench")
+            cli.ADD[words[0]](sub, words[1:])
+            return sub
+
+        print(script(shell, cli.COMMANDS, fill))
+
+    parser.set_defaults(run=run)

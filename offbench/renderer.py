@@ -1,0 +1,63 @@
+"""Off-screen rendering: which of MuJoCo's ways to draw without a screen works here."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+
+BACKENDS = ("egl", "osmesa")
+KEY = "MUJOCO_GL"
+PATIENCE = 60  # seconds that a probe may take
+NO_RENDERER = (
+    "MuJoCo cannot draw here: neither EGL nor OSMesa works; install one of them, e.g. `apt-get install libegl1 "
+    "libgl1-mesa-dri` or `apt-get install libosmesa6` (conda: mesalib)"
+)
+PROBE = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><light pos='0 0 3'/><geom size='1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 16, 16) as renderer:
+    renderer.update_scene(data)
+    assert renderer.render().any()
+"""
+
+
+@functools.cache
+def working_backend() -> str | None:
+    """Return the first of the user's MUJOCO_GL, EGL and OSMesa that draws a picture; None if none does.
+
+    Each is tried in a process of its own: a broken driver may crash it, and MuJoCo chooses but once a process.
+    """
+    own = os.environ.get(KEY)
+    return next((name for name in dict.fromkeys([own, *BACKENDS] if own else BACKENDS) if _draws(name)), None)
+
+
+def _draws(backend: str) -> bool:
+    environment = {key: value for key, value in os.environ.items() if key != "PYOPENGL_PLATFORM"} | {KEY: backend}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", PROBE], env=environment, capture_output=True, timeout=PATIENCE, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+@contextlib.contextmanager
+def drawing_with(backend: str | None) -> Iterator[None]:
+    """Let MuJoCo draw with `backend`, which it reads from the environment; None leaves things as they are."""
+    before = os.environ.get(KEY)
+    if backend:
+        os.environ[KEY] = backend
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(KEY, None)
+        else:
+            os.environ[KEY] = before

@@ -1,0 +1,129 @@
+"""Every command and Python block of README and docs runs, in its order, with no other set-up (see doc_blocks)."""
+
+from __future__ import annotations
+
+import re
+import sys
+import tomllib
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from tests.doc_blocks import (
+    DOCS,
+    LANGUAGES,
+    REASONS,
+    ROOT,
+    Block,
+    blocks,
+    commands,
+    environment_beside,
+    pages,
+    run_page,
+)
+
+OPTIONAL = ("benchmarks.md", "results/", "../datasets/")  # generated
+PAGES = [page for page in pages() if any(block.runs for block in blocks(page)) and page.name != "interop.md"]
+ALL = [block for page in pages() if page.name != "interop.md" for block in blocks(page)]
+
+
+@pytest.fixture(scope="session")
+def beside(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An environment of its own for pages that install something."""
+    return environment_beside(tmp_path_factory.mktemp("beside") / "env")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_block_of_the_page_runs(page: Path, home: Path, request: pytest.FixtureRequest) -> None:
+    installs = any("pip install ./" in block.content for block in blocks(page) if block.runs)
+    python = request.getfixturevalue("beside") if installs else Path(sys.executable)
+    expected = sum(1 if b.language == "python" else len(commands(b)) for b in blocks(page) if b.runs)
+    assert run_page(page, home, python) == expected
+
+
+def test_blocks_that_do_not_run_say_why(capsys: pytest.CaptureFixture[str]) -> None:
+    left_out = [block for block in ALL if block.reason]
+    unknown = {block.reason for block in left_out} - set(REASONS)
+    assert not unknown
+    assert {block.language for block in ALL} <= set(LANGUAGES)
+    for block in ALL:
+        assert block.runs or block.title or block.note or block.language not in ("sh", "python"), block
+    counts = Counter((block.reason, block.page) for block in left_out)
+    with capsys.disabled():
+        print(f"\n{sum(block.runs for block in ALL)} blocks of README and docs run; {len(left_out)} do not:")
+        for (reason, page), count in sorted(counts.items()):
+            print(f"  {count} of {page}: {reason}")
+
+
+def test_no_command_hides_outside_the_blocks_that_run() -> None:
+    command = re.compile(r"^(?: {4,}|\t)\$? ?(?:offbench|make|pip|python) ", re.M)
+    for page in (page for page in pages() if page.name != "interop.md"):
+        outside = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)
+        assert not command.search(outside), page.name
+    for block in ALL:
+        if block.language == "text":
+            assert not re.search(r"^\$? ?offbench ", block.content, re.M), block
+
+
+def test_shown_parts_of_files_are_there_word_for_word() -> None:
+    shown = [block for block in ALL if block.note.startswith("part of ")]
+    assert shown
+    for block in shown:
+        assert block.content in (DOCS / block.note.removeprefix("part of ")).read_text(), block
+
+
+def test_links_lead_somewhere() -> None:
+    count = 0
+    for page in pages():
+        text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)|(?:src|href)=\"([^\"#]+)", text):
+            link = target[0] or target[1]
+            if re.match(r"https?://", link) or link.removeprefix("docs/").startswith(OPTIONAL):
+                continue
+            assert (page.parent / link).exists(), f"{page.name}: {link}"
+            count += 1
+    assert count > 20
+
+
+def test_every_page_is_in_the_sites_contents() -> None:
+    listed = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    assert {page.name for page in DOCS.glob("*.md")} <= listed
+
+
+def test_ci_calls_the_readmes_two_commands() -> None:
+    ci = (ROOT / ".ci" / "run").read_text().splitlines()
+    assert {"make demo", "make test", "make docs"} <= set(ci)
+    assert any(b.content == "make demo\nmake test\n" for b in blocks(ROOT / "README.md"))
+
+
+def test_the_parser_of_blocks_reads_notes_titles_and_contents(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    first = "```sh\na \\\n  b\n# c\nd\n```\n"
+    second = "<!-- not run: needs a GPU -->\n```sh\ne\n```\n"
+    page.write_text(f'# x\n\n{first}\n{second}\n```toml title="f.toml"\ng = 1\n```\n')
+    one, two, three = blocks(page)
+    assert one == Block("page.md", "sh", "", "", "a \\\n  b\n# c\nd\n")
+    assert commands(one) == ["a    b", "d"]
+    assert (one.runs, two.runs, three.runs) == (True, False, False)
+    assert (two.reason, three.title) == ("needs a GPU", "f.toml")
+
+
+def test_citation_names_the_version_and_licence() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"version: {project['version']}" in citation
+    assert f"license: {project['license']}" in citation
+
+
+@pytest.mark.slow
+def test_the_site_builds_strictly(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason="the docs extra is not installed: `make docs` builds the site")
+    import subprocess
+
+    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Hopper-v5 at three levels" in (tmp_path / "site" / "index.html").read_text()
+    assert 'id="offbench.record.collect"' in (tmp_path / "site" / "api.html").read_text()
