@@ -22,11 +22,15 @@ from offbench.errors import OffbenchError
 if TYPE_CHECKING:
     from offbench.agents import behaviour
     from offbench.assess import evaluate
+    from offbench.benchmarking import benchmark
+    from offbench.cards import card
     from offbench.comparison import compare
     from offbench.d4rl import import_d4rl
     from offbench.deploy import export_policy
     from offbench.describe import inventory, show
+    from offbench.diagnosis import doctor
     from offbench.exports import export
+    from offbench.filming import video
     from offbench.launch import train
     from offbench.record import collect
     from offbench.reports import report
@@ -37,8 +41,11 @@ if TYPE_CHECKING:
 __all__ = [
     "OffbenchError",
     "behaviour",
+    "benchmark",
+    "card",
     "collect",
     "compare",
+    "doctor",
     "evaluate",
     "export",
     "export_policy",
@@ -50,13 +57,17 @@ __all__ = [
     "show",
     "train",
     "verify",
+    "video",
 ]
 
 # Loaded when first used: `offbench list` must not wait for PyTorch.
 _VERBS = {
     "behaviour": ("offbench.agents", "behaviour"),
+    "benchmark": ("offbench.benchmarking", "benchmark"),
+    "card": ("offbench.cards", "card"),
     "collect": ("offbench.record", "collect"),
     "compare": ("offbench.comparison", "compare"),
+    "doctor": ("offbench.diagnosis", "doctor"),
     "evaluate": ("offbench.assess", "evaluate"),
     "export": ("offbench.exports", "export"),
     "export_policy": ("offbench.deploy", "export_policy"),
@@ -68,6 +79,7 @@ _VERBS = {
     "show": ("offbench.describe", "show"),
     "train": ("offbench.launch", "train"),
     "verify": ("offbench.verification", "verify"),
+    "video": ("offbench.filming", "video"),
 }
 
 

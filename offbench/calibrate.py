@@ -20,6 +20,7 @@ from offbench.transitions import Transitions
 SECONDS = 0.5  # that a measurement lasts at least
 ROWS = 4096  # made-up transitions
 ENV_STEPS = 2000
+COUNTED = 4  # updates whose operations are counted: of every kind that takes turns
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,19 @@ def measure(algorithm: str, config: Any, spec: str, device: str, *, tf32: bool =
             wanted = max(2, min(10 * wanted, round(1.2 * SECONDS * wanted / spent)))
     size = sum(t.numel() * t.element_size() for t in learning.run_tensors(0).values())
     return Rate(wanted * runs / spent, runs, size)
+
+
+def operations(algorithm: str, config: Any, spec: str) -> float:
+    """Return the floating-point operations of an update's matrix products, as PyTorch counts them (2 m n k each)."""
+    from torch.utils.flop_counter import FlopCounterMode
+
+    learning = Stack(load_algorithm(algorithm), [made_up(algorithm, config, spec)], "cpu")
+    for _ in learning.train(2 * WARM_UP):  # past whatever happens only once
+        pass
+    with FlopCounterMode(display=False) as counter:
+        for _ in learning.train(2 * WARM_UP + COUNTED):
+            pass
+    return float(counter.get_total_flops()) / COUNTED
 
 
 def made_up(algorithm: str, config: Any, spec: str) -> Member:

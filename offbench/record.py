@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from offbench import dataset
-from offbench.card import compare
+from offbench.cards import compare
 from offbench.environments import make_env
 from offbench.errors import OffbenchError
 from offbench.files import sha256

@@ -12,15 +12,22 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import offbench
-from offbench import benchmark, dataset
+from offbench import dataset
+from offbench.benchmarking import benchmark
+from offbench.calibrate import operations
 from offbench.cli import main
 from offbench.errors import OffbenchError
 from offbench.grid import load_grid, shipped_grids
+from offbench.planning import plan, prepare
+from offbench.recipes import load_recipe
+from offbench.registry import load_algorithm
 from offbench.runs import Run, find_runs
 from offbench.tables import score_runs
+from tests.speed.arithmetic import ALGORITHMS
 
 GRID = """
 datasets = ["DATASET"]
@@ -57,7 +64,7 @@ def silent(_: str) -> None:
 
 def test_the_papers_grid_is_its_table() -> None:
     """15 datasets x (TD3+BC, CQL, four BDB) x 5 seeds = 450 runs of a million updates."""
-    bench = benchmark.prepare("paper", workers=1)
+    bench = prepare("paper", workers=1)
     assert sum(len(bench.orders(one)) for one in bench.variants) == 450
     assert {one.times.steps for one in bench.variants} == {1_000_000}
     assert {one.times.eval_every for one in bench.variants} == {5_000}
@@ -75,8 +82,8 @@ def test_the_papers_grid_is_its_table() -> None:
 
 @pytest.mark.parametrize("name", shipped_grids())
 def test_shipped_grids_are_sound_and_their_plan_counts_what_is_left(name: str) -> None:
-    bench = benchmark.prepare(name, workers=2)
-    first, *lines = benchmark.plan(bench)
+    bench = prepare(name, workers=2)
+    first, *lines = plan(bench)
     runs = sum(len(bench.orders(one)) for one in bench.variants)
     assert (
         first
@@ -84,10 +91,20 @@ def test_shipped_grids_are_sound_and_their_plan_counts_what_is_left(name: str) -
     )
     assert any("to record first" in line for line in lines)
     assert "on 2 processes of one thread about" in lines[-2]
+    assert "on a GPU: not measured here" in lines[-1]
+
+
+@pytest.mark.parametrize(("algorithm", "settings"), [("td3_bc", {}), ("bdb", {}), ("cql", {"bc_steps": 0})])
+def test_the_plans_operations_are_those_counted_by_hand(algorithm: str, settings: dict[str, Any]) -> None:
+    config = load_algorithm(algorithm).Config(**settings)
+    by_hand = ALGORITHMS[algorithm](11, 3, config.batch_size, config.hidden)
+    wanted = sum(often * 2 * np.prod([float(size) for size in product]) for often, product in by_hand)
+    counted = operations(algorithm, config, load_recipe("hopper").env_spec())
+    assert counted == pytest.approx(wanted, rel=1e-9)
 
 
 def test_a_finished_grid_is_left_alone(grid: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert benchmark.benchmark(grid, workers=1, say=silent)
+    assert benchmark(prepare(grid, workers=1), say=silent)
     runs = find_runs(home / "runs")
     assert {(r.config()["algorithm"], r.config()["seed"], r.config()["steps"]) for r in runs} == {
         ("td3_bc", 0, 200),
@@ -106,13 +123,13 @@ def test_a_finished_grid_is_left_alone(grid: str, home: Path, capsys: pytest.Cap
 def test_missing_datasets_are_recorded_first(home: Path) -> None:
     text = GRID.replace('"DATASET"', '{id = "mine-v0", env = "inverted-pendulum", level = "random", steps = 500}')
     (home / "grid.toml").write_text(text)
-    assert benchmark.benchmark("./grid.toml", workers=1, say=silent)
+    assert benchmark(prepare("./grid.toml", workers=1), say=silent)
     assert dataset.read_metadata("mine-v0")["total_steps"] == 500
 
 
 def test_a_budget_stops_cleanly_and_the_same_call_goes_on(grid: str) -> None:
-    assert not benchmark.benchmark(grid, workers=1, budget="0.001s", say=silent)
-    assert benchmark.benchmark(grid, workers=1, budget="1h", say=silent)
+    assert not benchmark(prepare(grid, workers=1), budget="0.001s", say=silent)
+    assert benchmark(prepare(grid, workers=1), budget="1h", say=silent)
 
 
 def test_a_budget_that_ends_before_any_evaluation_is_no_error(grid: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -121,9 +138,9 @@ def test_a_budget_that_ends_before_any_evaluation_is_no_error(grid: str, capsys:
 
 
 def test_shards_share_the_runs_and_together_are_the_grid(grid: str, home: Path) -> None:
-    benchmark.benchmark(grid, workers=1, say=silent, runs="whole", stack=1)
+    benchmark(prepare(grid, workers=1, runs="whole", stack=1), say=silent)
     for place in range(3):
-        benchmark.benchmark(grid, workers=1, say=silent, runs="shared", stack=1, shard=(place, 3))
+        benchmark(prepare(grid, workers=1, runs="shared", stack=1), shard=(place, 3), say=silent)
         counted = len([run for run in find_runs(home / "shared") if run.evaluations()])
         assert counted == (2, 3, 4)[place]  # four stacks of one run dealt to three
     for run in find_runs(home / "whole"):
@@ -188,7 +205,7 @@ def test_bad_words_are_one_line(words: list[str], message: str, capsys: pytest.C
 
 def test_a_shard_beyond_the_last_is_refused(grid: str) -> None:
     with pytest.raises(OffbenchError, match="a shard is i/n"):
-        benchmark.benchmark(grid, shard=(2, 2), workers=1, say=silent)
+        benchmark(prepare(grid, workers=1), shard=(2, 2), say=silent)
 
 
 @pytest.mark.parametrize(
@@ -238,11 +255,11 @@ def test_smoke_survives_five_kill_9(home: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_run_that_diverged_before_is_said_and_left_alone(grid: str, home: Path) -> None:
-    assert benchmark.benchmark(grid, workers=1, say=silent)
+    assert benchmark(prepare(grid, workers=1), say=silent)
     run = find_runs(home / "runs")[0]
     run.mark_diverged(100, "critic.flat")
     said: list[str] = []
-    assert benchmark.benchmark(grid, workers=1, say=said.append)
+    assert benchmark(prepare(grid, workers=1), say=said.append)
     assert (
         said[-1] == f"{run.folder.relative_to(home)} has diverged before and is left as it is; delete it to try again"
     )

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import offbench
-from offbench import card, dataset
-from offbench.card import compare
+from offbench import dataset
+from offbench.cards import card, compare
 from offbench.errors import OffbenchError
 from offbench.files import read_json
 from offbench.levels import LEVELS
@@ -74,16 +74,16 @@ def test_a_card_is_made_from_the_five_levels(home: Path) -> None:
     with pytest.raises(
         OffbenchError, match="inverted-pendulum-random-v0 is not recorded yet; first `offbench collect"
     ):
-        card.card("inverted-pendulum")
+        card("inverted-pendulum")
     for level in LEVELS:
         offbench.collect("inverted-pendulum", level)
-    folder = card.card("inverted-pendulum", home / "card")
+    folder = card("inverted-pendulum", home / "card")
     for name in ("card.json", "README.md"):
         assert (folder / name).read_text() == (shipped("inverted-pendulum") / name).read_text()
     assert (folder / "card.png").read_bytes().startswith(b"\x89PNG")
     offbench.collect("inverted-pendulum", "random", steps=500, overwrite=True)
     with pytest.raises(OffbenchError, match="is not the level that is shipped"):
-        card.card("inverted-pendulum")
+        card("inverted-pendulum")
 
 
 def test_another_content_is_said_with_the_likely_reason(home: Path) -> None:
@@ -100,4 +100,4 @@ def test_another_content_is_said_with_the_likely_reason(home: Path) -> None:
 
 def test_an_environment_without_a_ladder_has_no_card() -> None:
     with pytest.raises(OffbenchError, match="ant has no shipped ladder"):
-        card.card("ant")
+        card("ant")

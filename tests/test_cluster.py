@@ -11,8 +11,10 @@ from typing import Any
 
 import pytest
 
-from offbench import benchmark, cluster
+from offbench import cluster
+from offbench.benchmarking import benchmark
 from offbench.errors import OffbenchError
+from offbench.planning import prepare
 from offbench.runs import Run, find_runs
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
@@ -48,9 +50,8 @@ def two_nodes(home: Path) -> Iterator[Any]:
 
 
 def run(where: str, executor: Any) -> bool:
-    return benchmark.benchmark(
-        "./grid.toml", runs=where, workers=2, stack=1, device="cpu", executor=executor, say=lambda line: None
-    )
+    bench = prepare("./grid.toml", runs=where, workers=2, stack=1, device="cpu")
+    return benchmark(bench, executor=executor, say=lambda line: None)
 
 
 def same(home: Path, ours: str, theirs: str) -> None:

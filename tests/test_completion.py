@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from offbench.cli import ADD, COMMANDS
+from offbench.cli import COMMANDS
 from offbench.registry import algorithm_names
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]
@@ -42,7 +42,7 @@ def bash(offbench_cli: Cli, home: Path) -> Callable[..., list[str]]:
 
 
 def test_bash_offers_every_command(bash: Callable[..., list[str]]) -> None:
-    assert bash("") == list(COMMANDS) == list(ADD)
+    assert bash("") == list(COMMANDS)
     assert bash("coll") == ["collect"]
 
 

@@ -12,7 +12,7 @@ import gymnasium
 import mujoco
 import pytest
 
-from offbench import doctor
+from offbench import diagnosis
 from offbench.provenance import versions
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]
@@ -47,7 +47,7 @@ def test_folders_that_cannot_be_written_are_broken(offbench_cli: Cli, home: Path
 
 
 def test_the_physics_check_sees_other_physics(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert doctor.replay_error(16) < 1e-5
+    assert diagnosis.replay_error(16) < 1e-5
     make = gymnasium.make
 
     def lighter(*args: object, **kwargs: object) -> gymnasium.Env:
@@ -57,9 +57,9 @@ def test_the_physics_check_sees_other_physics(monkeypatch: pytest.MonkeyPatch) -
         return env
 
     monkeypatch.setattr(gymnasium, "make", lighter)
-    assert doctor.replay_error(16) > 1e-5
-    monkeypatch.setattr(doctor, "TOLERANCE", 1e-5)
-    (finding,) = [f for f in doctor.doctor() if f.name == "physics"]
+    assert diagnosis.replay_error(16) > 1e-5
+    monkeypatch.setattr(diagnosis, "TOLERANCE", 1e-5)
+    (finding,) = [f for f in diagnosis.doctor() if f.name == "physics"]
     assert finding.state == "broken"
     assert "mujoco" in finding.text
 
@@ -68,8 +68,8 @@ def test_a_broken_algorithm_and_a_missing_package_are_named(monkeypatch: pytest.
     from offbench import registry
 
     monkeypatch.setattr(registry, "algorithm_names", lambda: ["td3_bc", "gone"])
-    monkeypatch.setattr(doctor, "versions", lambda: {"python": "3.11", "minari": "not installed"})
-    found = {(f.name, f.state): f.text for f in doctor.doctor()}
+    monkeypatch.setattr(diagnosis, "versions", lambda: {"python": "3.11", "minari": "not installed"})
+    found = {(f.name, f.state): f.text for f in diagnosis.doctor()}
     assert "gone" in found["algorithms", "broken"]
     assert "td3_bc" in found["algorithms", "ok"]
     assert "minari not installed" in found["versions", "broken"]
@@ -79,7 +79,7 @@ def test_no_renderer_is_worth_a_note_and_names_the_packages(monkeypatch: pytest.
     from offbench import renderer
 
     monkeypatch.setattr(renderer, "working_backend", lambda: None)
-    (finding,) = [f for f in doctor.doctor() if f.name == "renderer"]
+    (finding,) = [f for f in diagnosis.doctor() if f.name == "renderer"]
     assert finding.state == "note"
     assert "libegl1" in finding.text
     assert "libosmesa6" in finding.text

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from offbench import renderer, video
+from offbench import filming, renderer
 from offbench.errors import OffbenchError
 from offbench.recipes import shipped
 
@@ -52,7 +52,7 @@ def test_a_gif_shows_the_episode_with_step_and_return(offbench_cli: Cli, home: P
 @pytest.mark.usefixtures("draws")
 def test_an_mp4_is_a_film_of_its_frames(home: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed: no mp4 was made")
-    made = video.video("inverted-pendulum:expert", out="film.mp4", episodes=2, seconds=0.8, fps=25, size=96)
+    made = filming.video("inverted-pendulum:expert", out="film.mp4", episodes=2, seconds=0.8, fps=25, size=96)
     frames, seconds = ffmpeg.count_frames_and_secs(str(made))
     assert frames == 21  # 20 steps and the first frame: --seconds counts for the whole film
     assert seconds == pytest.approx(21 / 25, abs=0.05)
@@ -63,14 +63,14 @@ def test_a_film_of_a_run_plays_its_environment(medium: str, home: Path) -> None:
     import offbench
 
     (run,) = offbench.train("bc", medium, steps=2, eval_every=2, eval_episodes=1, hidden=(8,), workers=1)
-    made = video.video(run, out=home / "new" / "run.gif", seconds=0.2, size=64)
+    made = filming.video(run, out=home / "new" / "run.gif", seconds=0.2, size=64)
     assert len(frames_of(made)) == 6
 
 
 def test_without_a_renderer_the_packages_are_named(monkeypatch: pytest.MonkeyPatch, home: Path) -> None:
-    monkeypatch.setattr(video, "working_backend", lambda: None)
+    monkeypatch.setattr(filming, "working_backend", lambda: None)
     with pytest.raises(OffbenchError, match=r"libegl1 .*libosmesa6"):
-        video.video(POLICY, out="film.gif")
+        filming.video(POLICY, out="film.gif")
     assert not (home / "film.gif").exists()
 
 
@@ -119,4 +119,4 @@ def test_mp4_without_its_encoder_names_the_extra(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(OffbenchError, match=r"offbench\[video\]"):
-        video.video(POLICY, out="film.mp4")
+        filming.video(POLICY, out="film.mp4")

@@ -46,10 +46,10 @@ def td3_bc(obs: int, act: int, batch: int, hidden: tuple[int, ...]) -> Iterator[
 
 
 def bdb(obs: int, act: int, batch: int, hidden: tuple[int, ...]) -> Iterator[tuple[float, Product]]:
-    """TD3+BC, and every second update the discriminator, its gradient for the actor, and the uncertainty."""
+    """TD3+BC, whose pi(s) and Q1 serve here too; every second update the discriminator, its gradient, and Q2."""
     yield from td3_bc(obs, act, batch, hidden)
-    actor, critic, judge = (obs, *hidden, act), (obs + act, *hidden, 1), (obs + act, 64, 64, 1)
-    second = [*forward(actor, batch), *forward(judge, 2 * batch), *weights(judge, 2 * batch)]
+    critic, judge = (obs + act, *hidden, 1), (obs + act, 64, 64, 1)
+    second = [*forward(judge, 2 * batch), *weights(judge, 2 * batch)]
     second += [*forward(judge, batch), *inputs(judge, batch), *forward(critic, batch)]  # Q2, for max - min
     yield from ((0.5, product) for product in second)
 

@@ -1,68 +1,32 @@
-"""`benchmark`: a whole grid, from missing datasets to the score table; stopped at any point, it goes on.
-
-grid -> plan: runs, stacks, expected hours, disk
-     -> datasets that are missing are recorded
-     -> runs cut into parts -> a shard's parts -> what is left of them -> jobs -> an executor
-"""
+"""Planning: a grid at one place, the runs that are left of it, and what they cost there."""
 
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from offbench import checkpoints, dataset
-from offbench.calibrate import Rate, measure, step_seconds
+from offbench.calibrate import Rate, measure, operations, step_seconds
 from offbench.devices import pick_device
 from offbench.errors import OffbenchError
 from offbench.grid import Entry, Grid, Source, Times, load_grid
-from offbench.jobs import Job, Order, complain, run_jobs
+from offbench.jobs import Order
 from offbench.launch import configurations
 from offbench.levels import parse_level
 from offbench.progress import duration
 from offbench.recipes import Recipe, load_recipe
-from offbench.record import record_source
 from offbench.registry import load_algorithm
 from offbench.runs import run_folder, settings_dict, variant
-from offbench.stacking import Part, cut, diverged, pending, with_evaluators
-from offbench.training import Schedule
 from offbench.workers import default_workers
 
-UNITS = {"s": 1, "m": 60, "h": 3600}
-
-
-class Executor(Protocol):
-    """Where recordings and trainings happen."""
-
-    def record(self, sources: Sequence[Source], workers: int) -> None:
-        """Record datasets. Raises OffbenchError if one cannot be."""
-        ...
-
-    def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
-        """Train jobs as far as their deadline; return what went wrong, a line each."""
-        ...
-
-
-class LocalExecutor:
-    """This machine's processes."""
-
-    def __init__(self, deadline: float | None = None) -> None:
-        self.deadline = deadline
-
-    def record(self, sources: Sequence[Source], workers: int) -> None:
-        """Record datasets, one after the other, until the deadline."""
-        for source in sources:
-            if self.deadline is None or time.time() < self.deadline:
-                record_source(source, workers)
-
-    def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
-        """Train jobs in so many processes."""
-        return run_jobs(jobs, processes)
+# What a large GPU is taken to do of a stack's small float32 products where there is none to measure: a seventh of an
+# H100's 67 Tflop/s.
+GPU_SPEED = 1e13
 
 
 @dataclass(frozen=True)
@@ -117,60 +81,6 @@ class Benchmark:
         return [source for source in self.grid.datasets if source.id not in here]
 
 
-def benchmark(
-    grid: str,
-    *,
-    runs: str | Path = "runs",
-    device: str = "auto",
-    workers: int | None = None,
-    stack: int | str = "auto",
-    tf32: bool = False,
-    budget: str | None = None,
-    shard: tuple[int, int] = (0, 1),
-    executor: Executor | None = None,
-    command: str = "",
-    say: Callable[[str], None] = print,
-) -> bool:
-    """Run a grid to its end, or as far as the budget allows; finished parts are left alone.
-
-    Args:
-        grid: a shipped grid's name (paper, paper-small, smoke) or a file (`./mine.toml`).
-        runs: the folder of all run directories.
-        device, workers, stack, tf32: as in `train`.
-        budget: "9m", "2h" or "90s": stops cleanly after that time; the same call goes on.
-        shard: (i, n): the i-th of n shares of the stacks, for machines with a shared file system.
-        executor: where it happens: this machine (default), or a cluster (offbench.cluster.RayExecutor).
-        command: what the user typed, for each run's config.json.
-        say: takes the plan, line by line.
-
-    Returns:
-        Whether the grid (of this shard) is finished.
-
-    Raises:
-        OffbenchError: anything that the user can mend; runs that diverged, once all others are done.
-    """
-    deadline = time.time() + _seconds(budget) if budget else None
-    executor = executor or LocalExecutor(deadline)
-    bench = prepare(grid, runs=runs, device=device, workers=workers, stack=stack, tf32=tf32)
-    for line in plan(bench):
-        say(line)
-    executor.record(bench.missing(), bench.workers)
-    if bench.missing():
-        return False  # out of time
-    parts = _parts(bench, shard)
-    jobs = [
-        job
-        for part, schedule in parts
-        for job in pending(part, replace(schedule, deadline=deadline), tf32=tf32, command=command)
-    ]
-    if bench.device != "cpu":
-        jobs = with_evaluators(jobs, bench.workers)
-    for line in diverged([part for part, _ in parts]):  # known since an earlier call, which failed for it
-        say(line)
-    complain(executor.train(jobs, bench.processes) if jobs else [])
-    return not any(pending(part, schedule, tf32=tf32, command=command) for part, schedule in parts)
-
-
 def prepare(
     grid: str,
     *,
@@ -180,7 +90,16 @@ def prepare(
     stack: int | str = "auto",
     tf32: bool = False,
 ) -> Benchmark:
-    """Read and check a grid. Raises OffbenchError for anything wrong in it."""
+    """Read and check a grid.
+
+    Args:
+        grid: a shipped grid's name or a file (`./mine.toml`).
+        runs: the folder of all run directories.
+        device, workers, stack, tf32: as in `train`.
+
+    Raises:
+        OffbenchError: anything wrong in it.
+    """
     read = load_grid(grid)
     variants = [Variant(e.algorithm, config, e.times) for e in read.entries for config in _configs(e)]
     if len({(v.algorithm, variant(v.config)) for v in variants}) < len(variants):
@@ -196,33 +115,6 @@ def _configs(entry: Entry) -> list[Any]:
     return configurations(kind.Config, entry.settings, entry.algorithm)
 
 
-def _seconds(text: str) -> float:
-    """Return the seconds of `9m`, `1.5h` or `90s`."""
-    try:
-        value = float(text[:-1]) * UNITS[text[-1]]
-    except (ValueError, KeyError, IndexError):
-        raise OffbenchError(f"a budget is a time like 9m, 1.5h or 90s, not {text!r}") from None
-    if not 0 < value < float("inf"):
-        raise OffbenchError(f"a budget must be more than nothing, not {text!r}")
-    return value
-
-
-def _parts(bench: Benchmark, shard: tuple[int, int]) -> list[tuple[Part, Schedule]]:
-    """Return this shard's parts. Runs of equal times are cut together, whatever their algorithm."""
-    place, count = shard
-    if not 0 <= place < count:
-        raise OffbenchError(f"a shard is i/n with i from 0 to n - 1, not {place}/{count}")
-    by_times: dict[Times, list[Variant]] = {}
-    for one in bench.variants:
-        by_times.setdefault(replace(one.times, seeds=()), []).append(one)
-    found = []
-    for times, variants in by_times.items():
-        orders = [order for one in variants for order in bench.orders(one)]
-        schedule = Schedule(times.steps, times.eval_every, times.eval_episodes, bench.device, workers=0)
-        found += [(part, schedule) for part in cut(orders, bench.device, bench.processes * count, bench.stack)]
-    return found[place::count]
-
-
 def plan(bench: Benchmark) -> Iterator[str]:
     """Yield what the grid is and what is left of it costs here, a line each; a finished grid costs no calibration."""
     specs = {source.env: _recipe(source).env_spec() for source in bench.grid.datasets if source.env}
@@ -235,7 +127,7 @@ def plan(bench: Benchmark) -> Iterator[str]:
     if not any(left.values()):
         return
     play = float(np.mean([step_seconds(spec) for spec in specs.values()]))
-    seconds, disk = 0.0, 0.0
+    seconds, disk, products = 0.0, 0.0, 0.0
     for one, orders in left.items():
         if not orders:
             continue
@@ -247,6 +139,8 @@ def plan(bench: Benchmark) -> Iterator[str]:
         )
         seconds += cost
         disk += 2 * rate.bytes_per_run * len(orders)
+        if bench.device == "cpu":
+            products += len(orders) * one.times.steps * operations(one.algorithm, one.config, spec)
     if missing := bench.missing():
         steps = sum(_size(source) for source in missing)
         seconds += steps * play / bench.workers
@@ -255,7 +149,11 @@ def plan(bench: Benchmark) -> Iterator[str]:
     where = f"{bench.processes} processes of one thread" if bench.device == "cpu" else bench.device
     yield f"  on {where} about {duration(seconds)}, {disk / 1e9:.1f} GB of disk (measured for a moment, just now)"
     if bench.device == "cpu":
-        yield "  on a GPU: not known here; the same command on a machine with one tells"
+        hours = duration(products / GPU_SPEED)
+        yield (
+            f"  on a GPU: not measured here; {products:.2g} operations in matrix products, which take {hours} "
+            f"if it does {GPU_SPEED / 1e12:.0f} Tflop/s of them"
+        )
 
 
 def _done(order: Order, times: Times) -> bool:

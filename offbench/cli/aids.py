@@ -6,7 +6,7 @@ import sys
 from json import dumps
 from typing import Any
 
-from offbench.arguments import Parser, natural, number, whole
+from offbench.cli.arguments import Parser, natural, number, whole
 
 
 def video_arguments(parser: Parser, _: list[str]) -> None:
@@ -21,7 +21,7 @@ def video_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--size", type=whole, default=480, help="longer side in pixels (default: 480)")
 
     def run(**arguments: Any) -> None:
-        from offbench.video import video
+        from offbench.filming import video
 
         print(f"film in {video(**arguments)}")
 
@@ -33,7 +33,7 @@ def doctor_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(json: bool) -> None:
-        from offbench.doctor import BROKEN, as_json, doctor
+        from offbench.diagnosis import BROKEN, as_json, doctor
 
         found = doctor()
         print(dumps(as_json(found), indent=1) if json else "\n".join(map(str, found)))
@@ -49,13 +49,13 @@ def completion_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("shell", choices=SHELLS)
 
     def run(shell: str) -> None:
-        from offbench import cli  # it knows all commands, this one too
+        from offbench.cli import COMMANDS  # all commands, this one too
 
         def fill(words: list[str]) -> Parser:
             sub = Parser(prog="offbench")
-            cli.ADD[words[0]](sub, words[1:])
+            COMMANDS[words[0]][1](sub, words[1:])
             return sub
 
-        print(script(shell, cli.COMMANDS, fill))
+        print(script(shell, {command: help_ for command, (help_, _) in COMMANDS.items()}, fill))
 
     parser.set_defaults(run=run)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from offbench.arguments import Parser, natural, whole
+from offbench.cli.arguments import Parser, natural, whole
 
 
 def verify_arguments(parser: Parser, _: list[str]) -> None:
-    """Arguments of `verify`."""
+    """Add the arguments of `verify`."""
     parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset, anybody's")
     parser.add_argument("--episodes", type=natural, help="to play again (default: 300; 0: none)")
     parser.add_argument("--workers", type=whole, help="processes (default: one a core)")
@@ -27,7 +27,7 @@ def verify_arguments(parser: Parser, _: list[str]) -> None:
 
 
 def import_arguments(parser: Parser, _: list[str]) -> None:
-    """Arguments of `import-d4rl`."""
+    """Add the arguments of `import-d4rl`."""
     parser.add_argument("file", metavar="FILE.hdf5", help="a D4RL file, or one that `offbench export` wrote")
     parser.add_argument("--id", dest="dataset_id", required=True, help="the Minari id, e.g. d4rl-hopper-medium-v2")
     parser.add_argument("--env", metavar="RECIPE", help="the environment to evaluate in (default: by the file's name)")
@@ -42,7 +42,7 @@ def import_arguments(parser: Parser, _: list[str]) -> None:
 
 
 def export_arguments(parser: Parser, _: list[str]) -> None:
-    """Arguments of `export`."""
+    """Add the arguments of `export`."""
     parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset")
     parser.add_argument("--out", required=True, metavar="FILE", help="the file to write")
     parser.add_argument("--format", choices=("d4rl", "npz"), default="d4rl", dest="style", help="default: d4rl")
@@ -59,7 +59,7 @@ def export_arguments(parser: Parser, _: list[str]) -> None:
 
 
 def export_policy_arguments(parser: Parser, _: list[str]) -> None:
-    """Arguments of `export-policy`."""
+    """Add the arguments of `export-policy`."""
     parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run directory or a policy file")
     parser.add_argument("--out", required=True, metavar="FILE.pt", help="the file to write")
 

@@ -1,0 +1,85 @@
+"""The command line: parse, call, print. Everything it does is a function of the package."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+
+from offbench.cli import aids, data, results, training, travel
+from offbench.cli.arguments import Parser
+from offbench.errors import OffbenchError, unknown
+
+# What each does, and what adds its arguments.
+COMMANDS: dict[str, tuple[str, Callable[[Parser, list[str]], None]]] = {
+    "collect": (
+        "record a dataset: random, medium, medium-replay, medium-expert, expert, or a fraction",
+        data.collect_arguments,
+    ),
+    "train": ("train an algorithm on a dataset, with evaluations as it goes", training.train_arguments),
+    "benchmark": ("a whole grid: datasets x algorithms x settings x seeds, resumable", training.benchmark_arguments),
+    "normalize": ("the score table of all runs, or the scores of given returns", results.normalize_arguments),
+    "report": ("all runs as one page, with tables and figures as files", results.report_arguments),
+    "compare": ("two methods over the datasets and seeds that both have, with a verdict", results.compare_arguments),
+    "evaluate": ("play a run's policy, or a policy file", results.evaluate_arguments),
+    "behaviour": ("train an environment's behaviour agent (SAC) and build its ladder", data.behaviour_arguments),
+    "list": ("environments, levels, algorithms and local datasets", data.list_arguments),
+    "show": ("what is in a dataset", data.show_arguments),
+    "verify": (
+        "check a dataset: its arrays, its metadata, and a sample of episodes played again",
+        travel.verify_arguments,
+    ),
+    "import-d4rl": ("turn a D4RL file (v0, v1, v2) into a Minari dataset", travel.import_arguments),
+    "export": ("write a dataset as a D4RL file, or as arrays (npz)", travel.export_arguments),
+    "export-policy": ("write a run's policy as TorchScript", travel.export_policy_arguments),
+    "card": ("write an environment's dataset card from its five recorded levels", data.card_arguments),
+    "video": ("film a run's policy, a policy file, or a level such as hopper:medium", aids.video_arguments),
+    "doctor": (
+        "what a bug report needs: versions, physics, machine, paths; exit code 1 if something is broken",
+        aids.doctor_arguments,
+    ),
+    "completion": ("print a shell's completion of these commands", aids.completion_arguments),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run one command.
+
+    Exits with 0, 1 if `verify` found something, 2 for a problem the user can mend, 130 after Ctrl-C.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        _run(words)
+    except OffbenchError as error:
+        print(f"offbench: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("\noffbench: stopped; the same command goes on from the last checkpoint", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:  # the reader of a pipe (`| head`) has left
+        sys.stderr.close()
+        sys.exit(0)
+
+
+def _run(words: list[str]) -> None:
+    parser = Parser(prog="offbench", description="Offline-RL datasets and benchmarks.")
+    parser.add_argument("--version", action="version", version=_version())
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
+    name = next((word for word in words if not word.startswith("-")), None)
+    if name is not None and name not in COMMANDS:
+        raise unknown("command", name, COMMANDS)
+    for command, (help_, add_arguments) in COMMANDS.items():
+        sub = commands.add_parser(command, help=help_, description=help_[0].upper() + help_[1:] + ".")
+        if command == name:  # only the command that runs pays for its arguments
+            add_arguments(sub, words[words.index(name) + 1 :])
+    arguments = vars(parser.parse_args(words))
+    if arguments.pop("command") is None:
+        parser.print_help()
+        return
+    run: Callable[..., None] = arguments.pop("run")
+    run(**arguments)
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return f"offbench {version('offbench')}"

@@ -1,0 +1,115 @@
+"""The command line of training: `train` and `benchmark`. Parse, call, print."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from typing import Any
+
+from offbench.cli.arguments import Parser, auto, seed_list, share, whole
+
+SWITCHES = ("--tf32", "--tensorboard")  # flags of `train` without a value: the algorithm may follow them
+
+
+def train_arguments(parser: Parser, words: list[str]) -> None:
+    """Add the arguments of `train`."""
+    from offbench.registry import algorithm_names, load_algorithm
+    from offbench.settings import fields
+
+    parser.add_argument("algorithm", metavar="ALGO", help=f"one of {', '.join(algorithm_names())}")
+    parser.add_argument("--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets")
+    parser.add_argument("--seeds", type=seed_list, default=[0], metavar="LIST", help="3, 0,1,2 or 0:5 (default: 0)")
+    parser.add_argument("--steps", type=whole, default=1_000_000, help="updates (default: 1,000,000)")
+    parser.add_argument("--eval-every", type=whole, default=5_000, help="updates between evaluations (default: 5,000)")
+    parser.add_argument("--eval-episodes", type=whole, default=10, help="episodes of an evaluation (default: 10)")
+    _machine(parser)
+    parser.add_argument("--tensorboard", action="store_true", help="write event files beside each run")
+    parser.add_argument("--wandb", metavar="PROJECT", help="show the runs in a Weights & Biases project")
+    pairs = zip(["", *words], words, strict=False)
+    positions = [word for before, word in pairs if not before.startswith("--") or before in SWITCHES]
+    algorithm = next((word for word in positions if not word.startswith("-")), None)
+    if algorithm is None:
+        parser.epilog = "`offbench train ALGO --help` shows the algorithm's own settings."
+        return
+    group = parser.add_argument_group(f"settings of {algorithm}")
+    known = fields(load_algorithm(algorithm).Config)
+    for name, field in known.items():
+        several = bool(field.metadata.get("per_run"))
+        group.add_argument(
+            f"--{name.replace('_', '-')}",
+            dest=f"setting_{name}",
+            nargs="+" if several else None,
+            metavar="X",
+            default=argparse.SUPPRESS,
+            help=f"{field.metadata.get('help', '')} (default: {_default(field.default)})".replace("%", "%%"),
+        )
+
+    def run(**arguments: Any) -> None:
+        from offbench.launch import train
+
+        settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
+        rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
+        folders = train(**rest, **settings, command=shlex.join(["offbench", "train", *words]))
+        for folder in folders:
+            print(folder)
+        print(f"next: offbench normalize --runs {rest['runs']}")
+
+    parser.set_defaults(run=run)
+
+
+def _machine(parser: Parser) -> None:
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
+    parser.add_argument("--workers", type=whole, help="processes for training and evaluation (default: one a core)")
+    parser.add_argument("--stack", type=auto, default="auto", help="most runs that train as one program (auto or N)")
+    parser.add_argument("--tf32", action="store_true", help="on a GPU: faster, less precise matrix products")
+    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+
+
+def benchmark_arguments(parser: Parser, words: list[str]) -> None:
+    """Add the arguments of `benchmark`."""
+    from offbench.grid import shipped_grids
+
+    parser.add_argument("grid", metavar="GRID", help=f"{', '.join(shipped_grids())}, or a grid file")
+    parser.add_argument("--plan", action="store_true", help="print runs, cost and disk, and do nothing")
+    parser.add_argument("--budget", metavar="TIME", help="stop cleanly after 90s, 9m or 2h; the same command goes on")
+    parser.add_argument("--shard", type=share, default=(0, 1), metavar="I/N", help="the I-th of N shares, I from 0")
+    parser.add_argument("--executor", choices=("local", "ray"), default="local", help="default: local processes")
+    parser.add_argument(
+        "--address", help="of the Ray cluster, e.g. auto or ray://head:10001 (default: start one here)"
+    )
+    _machine(parser)
+
+    def run(
+        plan: bool,
+        budget: str | None,
+        shard: tuple[int, int],
+        executor: str,
+        address: str | None,
+        **arguments: Any,
+    ) -> None:
+        from offbench import planning, tables
+        from offbench.benchmarking import benchmark
+
+        if plan:
+            print("\n".join(planning.plan(planning.prepare(**arguments))))
+            return
+        command = shlex.join(["offbench", "benchmark", *words])
+        where = None
+        if executor == "ray":
+            from offbench.cluster import RayExecutor
+
+            where = RayExecutor(address)
+            arguments["workers"] = arguments["workers"] or where.cpus
+        bench = planning.prepare(**arguments)
+        finished = benchmark(bench, budget=budget, shard=shard, executor=where, command=command)
+        if any(bench.runs.rglob("evaluations.csv")):  # a small budget ends before there are any
+            print(tables.render(tables.score_runs(bench.runs)))
+        if not finished:
+            print("stopped at the budget; the same command goes on", file=sys.stderr)
+
+    parser.set_defaults(run=run)
+
+
+def _default(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
