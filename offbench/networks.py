@@ -3,8 +3,8 @@
     flat [copies, runs, P]          copies: 1 actor, or the M critics of a run
       = W0 [.., in, h] | b0 [.., h] | W1 [.., h, h] | b1 [.., h] | ...        (x @ W + b)
 
-One batched matrix product a layer serves all copies and runs, and Adam and Polyak are one pass over one
-tensor. Runs share nothing, so the gradient of the runs' summed losses is each run's own gradient.
+One call serves all copies and runs (offbench.perceptron), and Adam and Polyak are one pass over one tensor. Runs
+share nothing, so the gradient of the runs' summed losses is each run's own gradient.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ import torch
 from torch import Tensor
 
 from offbench import seeds
+from offbench.perceptron import perceptrons
 from offbench.seeds import Purpose
-
-ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
 
 
 class Learned:
@@ -69,7 +68,7 @@ class Network(Learned):
         device: torch.device | str = "cpu",
     ) -> None:
         self.sizes, self.copies, self.runs = tuple(sizes), copies, len(run_seeds)
-        self.activation = ACTIVATIONS[activation]
+        self.activation = activation
         self._shapes = list(itertools.pairwise(self.sizes))
         self._splits = [n for i, o in self._shapes for n in (i * o, o)]
         flat = np.stack([[self._initial(seed, index, copy) for seed in run_seeds] for copy in range(copies)])
@@ -96,14 +95,8 @@ class Network(Learned):
         copies, (runs, batch, width) = flat.shape[0], x.shape
         if copies > 1:
             x = x.expand(copies, runs, batch, width).reshape(copies * runs, batch, width)
-        parts = iter(torch.split(flat.reshape(copies * runs, -1), self._splits, dim=1))
-        last = len(self._shapes) - 1
-        for i, (fan_in, fan_out) in enumerate(self._shapes):
-            weight = next(parts).view(-1, fan_in, fan_out)
-            x = torch.baddbmm(next(parts).unsqueeze(1), x, weight)
-            if i < last:
-                x = self.activation(x)
-        return x.view(copies, runs, batch, -1)
+        out = perceptrons(flat.reshape(copies * runs, -1), x, self.sizes, self.activation)
+        return out.view(copies, runs, batch, -1)
 
     def layers(self, run: int) -> list[tuple[Tensor, Tensor]]:
         """Return (weight [in, out], bias [out]) of each layer of one run's first copy, on the CPU."""
