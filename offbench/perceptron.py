@@ -17,9 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# Below these sizes a call of oneDNN costs more than it saves.
-LEAST_WIDTH = 8
-LEAST_PRODUCTS = 2**20
+# Multiplications of a product below which a call of oneDNN costs more than it saves, measured over a range of shapes.
+WORTH_IT, WORTH_IT_WHEN_NARROW = 2**17, 2**21
 HAS_ONEDNN: bool = torch._C._has_mkldnn and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
@@ -31,40 +30,58 @@ def perceptrons(flat: Tensor, x: Tensor, sizes: Sequence[int], activation: str) 
         x: inputs [nets, batch, in].
         activation: of the hidden layers, relu or tanh.
     """
-    if x.is_cuda or len(x) == 1:
-        return _call(flat, x, sizes, activation)
-    each = zip(torch.split(flat, 1), torch.split(x, 1), strict=True)
-    return torch.cat([_call(*one, sizes, activation) for one in each])
-
-
-def _call(flat: Tensor, x: Tensor, sizes: Sequence[int], activation: str) -> Tensor:
     found: Tensor = _Perceptrons.apply(flat, x, tuple(sizes), activation)  # type: ignore[no-untyped-call]
     return found
 
 
 class _Perceptrons(torch.autograd.Function):
+    """On a GPU all nets at once; on a CPU one after the other, whose arrays stay in the cache."""
+
     @staticmethod
     def forward(ctx: Any, flat: Tensor, x: Tensor, sizes: tuple[int, ...], activation: str) -> Tensor:
-        entered, layers = [x], _layers(flat, sizes)
-        for weight, bias in layers[:-1]:
-            entered.append(affine(entered[-1], weight, bias, activation))
-        ctx.save_for_backward(flat, *entered)
+        outputs, kept = [], [flat]
+        for own, h in _groups(flat, x):
+            *hidden, last = _layers(own, sizes)
+            kept.append(h)
+            for weight, bias in hidden:
+                kept.append(h := affine(h, weight, bias, activation))
+            outputs.append(affine(h, *last, "none"))
+        ctx.save_for_backward(*kept)
         ctx.sizes, ctx.activation = sizes, activation
-        return affine(entered[-1], *layers[-1], "none")
+        return torch.cat(outputs) if len(outputs) > 1 else outputs[0]
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        flat, *entered = ctx.saved_tensors
+        flat, *kept = ctx.saved_tensors
         of_flat, of_x = ctx.needs_input_grad[:2]
-        grad, parts = grads[0], []
-        for (weight, _), h in zip(reversed(_layers(flat, ctx.sizes)), reversed(entered), strict=True):
-            if of_flat:
-                parts += [grad.sum(1), product(h.transpose(1, 2), grad).flatten(1)]
-            if h is not entered[0]:
-                grad = _before(product(grad, weight.transpose(1, 2)), h, ctx.activation)
-            elif of_x:
-                grad = product(grad, weight.transpose(1, 2))
-        return torch.cat(parts[::-1], 1) if of_flat else None, grad if of_x else None, None, None
+        layers = len(ctx.sizes) - 1
+        flat_grads: list[Tensor] = []
+        x_grads: list[Tensor] = []
+        for place, (own, grad) in enumerate(_groups(flat, grads[0])):
+            entered, parts = kept[place * layers : (place + 1) * layers], []
+            for layer, (weight, _) in reversed(list(enumerate(_layers(own, ctx.sizes)))):
+                h = entered[layer]
+                if of_flat:
+                    parts += [grad.sum(1), product(h.transpose(1, 2), grad).flatten(1)]
+                if layer:
+                    grad = _before(product(grad, weight.transpose(1, 2)), h, ctx.activation)
+                elif of_x:
+                    x_grads.append(product(grad, weight.transpose(1, 2)))
+            flat_grads += parts[::-1]
+        of_nets = _joined(flat_grads, flat.shape) if of_flat else None
+        return of_nets, torch.cat(x_grads) if of_x else None, None, None
+
+
+def _groups(flat: Tensor, x: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Return the nets that are computed together, with what belongs to them."""
+    if x.is_cuda or len(x) == 1:
+        return [(flat, x)]
+    return [(flat[net : net + 1], x[net : net + 1]) for net in range(len(x))]
+
+
+def _joined(parts: list[Tensor], shape: torch.Size) -> Tensor:
+    """Return pieces of gradients, each [nets of a group, numbers], as one tensor [nets, P]."""
+    return torch.cat(parts, 1).view(shape)  # one group of all nets, or groups of one net end to end
 
 
 def _layers(flat: Tensor, sizes: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
@@ -96,8 +113,9 @@ def _before(grad: Tensor, h: Tensor, activation: str) -> Tensor:
 
 def _onednn(a: Tensor, b: Tensor) -> bool:
     (nets, m, k), n = a.shape, b.shape[2]
-    fits = HAS_ONEDNN and nets == 1 and a.dtype == torch.float32 and not a.is_cuda
-    return fits and min(m, k, n) >= LEAST_WIDTH and m * k * n >= LEAST_PRODUCTS
+    if not HAS_ONEDNN or nets > 1 or n == 1 or a.dtype != torch.float32 or a.is_cuda:
+        return False
+    return m * k * n >= (WORTH_IT if k >= 64 else WORTH_IT_WHEN_NARROW)
 
 
 def _linear(a: Tensor, b: Tensor, bias: Tensor | None, activation: str) -> Tensor:
