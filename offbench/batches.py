@@ -80,20 +80,20 @@ class Store:
         """Return the transitions at `indices` [runs, batch], each run's counted from its own first."""
         flat = (indices + self.first).flatten()
         if self.chosen is not None:
-            flat = self.chosen[flat]
-        rows = self.rows[flat]
+            flat = self.chosen.index_select(0, flat)
+        rows = self.rows.index_select(0, flat)
         shape = (*indices.shape, -1)
-        observations = self.observations[rows].view(shape)
-        next_observations = self.observations[rows + 1].view(shape)
+        observations = self.observations.index_select(0, rows).view(shape)
+        next_observations = self.observations.index_select(0, rows + 1).view(shape)
         if self.normalize:
             observations = (observations - self.mean) / self.std
             next_observations = (next_observations - self.mean) / self.std
         return Batch(
             observations,
-            self.actions[flat].view(shape),
-            self.rewards[flat].view(indices.shape),
+            self.actions.index_select(0, flat).view(shape),
+            self.rewards.index_select(0, flat).view(indices.shape),
             next_observations,
-            self.masks[flat].view(indices.shape),
+            self.masks.index_select(0, flat).view(indices.shape),
         )
 
 

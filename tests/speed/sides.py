@@ -7,7 +7,9 @@ import multiprocessing
 import os
 import shutil
 import sys
+import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,26 +52,48 @@ def _member(algorithm: str, config: Any, rows: int) -> Any:
 
 
 def products(algorithm: str) -> Work:
-    """The matrix products of an update and nothing else; a unit is one update."""
+    """The matrix products of an update and nothing else, each the fastest way there is; a unit is one update."""
     import torch
 
+    from offbench.perceptron import HAS_ONEDNN
     from tests.speed.arithmetic import ALGORITHMS
 
     torch.set_num_threads(1)
     counted: dict[Any, float] = {}
     for often, product in ALGORITHMS[algorithm](11, 3, BATCH, HIDDEN):
         counted[product] = counted.get(product, 0) + often
-    tensors = []
+    calls: list[Callable[[], object]] = []
     for (copies, m, k, n), often in counted.items():
         a, b, out = torch.randn(copies, m, k), torch.randn(copies, k, n), torch.empty(copies, m, n)
-        tensors += [(a, b, out)] * round(2 * often)  # two updates: some come every second one
+        ways = [partial(torch.bmm, a, b, out=out)]
+        if HAS_ONEDNN:
+            ways.append(partial(_onednn, a, b.transpose(1, 2).contiguous()))  # the layout it likes best
+        calls += [min(ways, key=_seconds)] * round(2 * often)  # two updates: some come every second one
 
     def work() -> int:
-        for a, b, out in tensors:
-            torch.bmm(a, b, out=out)
+        for call in calls:
+            call()
         return 2
 
     return work
+
+
+def _onednn(a: Any, b: Any) -> None:
+    """[copies, m, k] @ [copies, n, k]^T by oneDNN, one copy after the other."""
+    import torch
+
+    for one, other in zip(a, b, strict=True):
+        torch.ops.mkldnn._linear_pointwise(one, other, None, "none", [], "")
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    """Return the least seconds of a few calls."""
+    found = []
+    for _ in range(20):
+        began = time.perf_counter()
+        call()
+        found.append(time.perf_counter() - began)
+    return min(found)
 
 
 def record(workers: str) -> Work:
