@@ -35,8 +35,6 @@ def perceptrons(flat: Tensor, x: Tensor, sizes: Sequence[int], activation: str) 
 
 
 class _Perceptrons(torch.autograd.Function):
-    """On a GPU all nets at once; on a CPU one after the other, whose arrays stay in the cache."""
-
     @staticmethod
     def forward(ctx: Any, flat: Tensor, x: Tensor, sizes: tuple[int, ...], activation: str) -> Tensor:
         outputs, kept = [], [flat]
@@ -48,60 +46,63 @@ class _Perceptrons(torch.autograd.Function):
             outputs.append(affine(h, *last, "none"))
         ctx.save_for_backward(*kept)
         ctx.sizes, ctx.activation = sizes, activation
-        return torch.cat(outputs) if len(outputs) > 1 else outputs[0]
+        return _together(outputs, x)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         flat, *kept = ctx.saved_tensors
         of_flat, of_x = ctx.needs_input_grad[:2]
-        layers = len(ctx.sizes) - 1
+        depth = len(ctx.sizes) - 1
         flat_grads: list[Tensor] = []
         x_grads: list[Tensor] = []
-        for place, (own, grad) in enumerate(_groups(flat, grads[0])):
-            entered, parts = kept[place * layers : (place + 1) * layers], []
-            for layer, (weight, _) in reversed(list(enumerate(_layers(own, ctx.sizes)))):
-                h = entered[layer]
+        for group, (own, grad) in enumerate(_groups(flat, grads[0])):
+            parts: list[Tensor] = []
+            layers = list(zip(_layers(own, ctx.sizes), kept[group * depth : (group + 1) * depth], strict=True))
+            for layer, ((weight, _), h) in reversed(list(enumerate(layers))):
                 if of_flat:
-                    parts += [grad.sum(1), product(h.transpose(1, 2), grad).flatten(1)]
+                    parts += [grad.sum(-2), product(h.mT, grad).flatten(-2)]
                 if layer:
-                    grad = _before(product(grad, weight.transpose(1, 2)), h, ctx.activation)
+                    grad = _before(product(grad, weight.mT), h, ctx.activation)
                 elif of_x:
-                    x_grads.append(product(grad, weight.transpose(1, 2)))
+                    x_grads.append(product(grad, weight.mT))
             flat_grads += parts[::-1]
-        of_nets = _joined(flat_grads, flat.shape) if of_flat else None
-        return of_nets, torch.cat(x_grads) if of_x else None, None, None
+        of_nets = torch.cat(flat_grads, -1).view(flat.shape) if of_flat else None
+        return of_nets, _together(x_grads, flat) if of_x else None, None, None
 
 
 def _groups(flat: Tensor, x: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Return the nets that are computed together, with what belongs to them."""
-    if x.is_cuda or len(x) == 1:
-        return [(flat, x)]
-    return [(flat[net : net + 1], x[net : net + 1]) for net in range(len(x))]
+    """Return what is computed together, nets and their arrays: all of them, or each without the nets' axis."""
+    return [(flat, x)] if _batched(x) else list(zip(flat.unbind(), x.unbind(), strict=True))
 
 
-def _joined(parts: list[Tensor], shape: torch.Size) -> Tensor:
-    """Return pieces of gradients, each [nets of a group, numbers], as one tensor [nets, P]."""
-    return torch.cat(parts, 1).view(shape)  # one group of all nets, or groups of one net end to end
+def _batched(x: Tensor) -> bool:
+    """On a GPU all nets at once; on a CPU one after the other, for one net's arrays stay in the cache."""
+    return x.is_cuda
+
+
+def _together(parts: list[Tensor], like: Tensor) -> Tensor:
+    """Return the groups' results as one tensor [nets, ...]."""
+    return parts[0] if _batched(like) else parts[0].unsqueeze(0) if len(parts) == 1 else torch.stack(parts)
 
 
 def _layers(flat: Tensor, sizes: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
-    """Return (weight [nets, in, out], bias [nets, out]) of each layer, views of `flat`."""
+    """Return (weight [.., in, out], bias [.., out]) of each layer, views of `flat` [.., P]."""
     shapes = list(itertools.pairwise(sizes))
-    parts = iter(torch.split(flat, [n for i, o in shapes for n in (i * o, o)], dim=1))
-    return [(next(parts).view(-1, i, o), next(parts)) for i, o in shapes]
+    parts = iter(flat.split_with_sizes([n for i, o in shapes for n in (i * o, o)], -1))
+    return [(next(parts).view(*flat.shape[:-1], *shape), next(parts)) for shape in shapes]
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor, activation: str) -> Tensor:
-    """Return activation(x @ weight + bias) [nets, batch, out]."""
+    """Return activation(x @ weight + bias) [.., batch, out]."""
     if _onednn(x, weight):
-        return _linear(x, weight, bias[0], activation)
-    out = torch.baddbmm(bias.unsqueeze(1), x, weight)
+        return _linear(x, weight.mT, bias, activation)
+    out = torch.addmm(bias, x, weight) if x.dim() == 2 else torch.baddbmm(bias.unsqueeze(1), x, weight)
     return out if activation == "none" else out.relu_() if activation == "relu" else out.tanh_()
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Return a @ b [nets, m, n]."""
-    return _linear(a, b, None, "none") if _onednn(a, b) else torch.bmm(a, b)
+    """Return a @ b [.., m, n]."""
+    return _linear(a, b.mT, None, "none") if _onednn(a, b) else a @ b
 
 
 def _before(grad: Tensor, h: Tensor, activation: str) -> Tensor:
@@ -112,13 +113,13 @@ def _before(grad: Tensor, h: Tensor, activation: str) -> Tensor:
 
 
 def _onednn(a: Tensor, b: Tensor) -> bool:
-    (nets, m, k), n = a.shape, b.shape[2]
-    if not HAS_ONEDNN or nets > 1 or n == 1 or a.dtype != torch.float32 or a.is_cuda:
+    if not HAS_ONEDNN or a.dim() > 2 or a.dtype != torch.float32 or a.is_cuda:
         return False
-    return m * k * n >= (WORTH_IT if k >= 64 else WORTH_IT_WHEN_NARROW)
+    (m, k), n = a.shape, b.shape[1]
+    return n > 1 and m * k * n >= (WORTH_IT if k >= 64 else WORTH_IT_WHEN_NARROW)
 
 
+# oneDNN's activation(a @ b.T + bias) of one network: the operation that PyTorch's own compiler calls.
 def _linear(a: Tensor, b: Tensor, bias: Tensor | None, activation: str) -> Tensor:
-    """oneDNN's activation(a @ b + bias) of one network: the operation that PyTorch's own compiler calls."""
-    found: Tensor = torch.ops.mkldnn._linear_pointwise(a[0], b[0].t(), bias, activation, [], "")
-    return found.unsqueeze(0)
+    found: Tensor = torch.ops.mkldnn._linear_pointwise(a, b, bias, activation, [], "")
+    return found

@@ -41,14 +41,15 @@ def made(sizes: Sequence[int], batch: int, nets: int) -> tuple[Tensor, Tensor, T
     )
 
 
-@pytest.mark.parametrize("onednn", [True, False])
+@pytest.mark.parametrize("way", ["as on a GPU", "one by one", "one by one with oneDNN"])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("nets", [1, 3])
 @pytest.mark.parametrize(("sizes", "batch"), [SMALL, LARGE])
 def test_outputs_and_gradients_are_autograds(
-    sizes: Sequence[int], batch: int, nets: int, activation: str, onednn: bool, monkeypatch: pytest.MonkeyPatch
+    sizes: Sequence[int], batch: int, nets: int, activation: str, way: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(perceptron, "HAS_ONEDNN", onednn and perceptron.HAS_ONEDNN)
+    monkeypatch.setattr(perceptron, "HAS_ONEDNN", perceptron.HAS_ONEDNN and way.endswith("oneDNN"))
+    monkeypatch.setattr(perceptron, "_batched", lambda _: way == "as on a GPU")
     flat, x, grad = (part.requires_grad_() for part in made(sizes, batch, nets))
     wanted = reference(flat, x, sizes, activation)
     wanted_grads = torch.autograd.grad(wanted, [flat, x], grad)
