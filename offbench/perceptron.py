@@ -1,7 +1,7 @@
 """The forward and backward pass of many equal perceptrons, written out.
 
 Autograd would do the same; written out it is half the time. On a CPU every product goes to oneDNN, which on some
-processors is twice as fast as what `@` calls (on AMD's: 200 against 88 Gflop/s) and applies the activation on its way,
+processors is twice as fast as what `@` calls (`make bench` compares them) and applies the activation on its way,
 no pass over an array is made twice, and only the gradients that somebody asks for are computed. On a GPU all
 perceptrons are one batched product a layer.
 

@@ -68,12 +68,12 @@ def test_similar_score_by_hand(medium: str) -> None:
 
 
 def test_similarity_on_the_command_line(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder,) = offbench.train("bdb", medium, steps=20, **SMALL)
+    folders = [str(folder) for folder in offbench.train("bdb", medium, seeds=[0, 1], steps=20, **SMALL)]
     capsys.readouterr()
-    main(["evaluate", str(folder), "--similarity"])
+    main(["evaluate", *folders, "--similarity"])
     out = capsys.readouterr().out
-    assert "by Q" in out
-    assert "by action" in out
+    assert out.count("by Q") == out.count("by action") == 2
+    assert all(folder in out for folder in folders)
 
 
 def test_similarity_needs_a_critic_and_its_dataset(tiny: tuple[str, str], medium: str) -> None:

@@ -62,7 +62,7 @@ def compare_arguments(parser: Parser, _: list[str]) -> None:
 
 def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `evaluate`."""
-    parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run directory or a policy file")
+    parser.add_argument("paths", nargs="+", metavar="RUN_OR_POLICY", help="run directories or policy files")
     parser.add_argument("--env", help="a recipe, instead of the environment the policy names")
     parser.add_argument("--episodes", type=whole, default=10, help="default: 10")
     parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
@@ -72,17 +72,21 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--action-tolerance", type=number, default=0.1, help="of its second reading")
     parser.add_argument("--workers", type=whole, help="processes (default: one a core)")
 
-    def run(similarity: bool, tolerance: float, action_tolerance: float, **arguments: Any) -> None:
-        from offbench import assess
+    def similar(path: str, tolerance: float, action_tolerance: float, seed: int) -> None:
+        from offbench.assess import similarity
 
-        if not similarity:
-            print("\n".join(assess.evaluate(**arguments).lines()))
-            return
-        found = assess.similarity(
-            arguments["path"], tolerance=tolerance, action_tolerance=action_tolerance, seed=arguments["seed"]
-        )
-        print(f"{arguments['path']}: similar score at step {found['step']:,} over {found['samples']:,} transitions")
+        found = similarity(path, tolerance=tolerance, action_tolerance=action_tolerance, seed=seed)
+        print(f"{path}: similar score at step {found['step']:,} over {found['samples']:,} transitions")
         print(f"by Q       {found['q_similar']:.2f}%  (within {100 * tolerance:g}% of |Q1(s, a)|)")
         print(f"by action  {found['action_similar']:.2f}%  (root mean square distance at most {action_tolerance:g})")
+
+    def run(paths: list[str], similarity: bool, tolerance: float, action_tolerance: float, **arguments: Any) -> None:
+        from offbench.assess import evaluate
+
+        for path in paths:
+            if similarity:
+                similar(path, tolerance, action_tolerance, arguments["seed"])
+            else:
+                print("\n".join(([path] if len(paths) > 1 else []) + evaluate(path, **arguments).lines()))
 
     parser.set_defaults(run=run)

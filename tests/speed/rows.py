@@ -67,6 +67,11 @@ def rows(dataset: str) -> list[Row]:
             5.0,
         ),
         Row(
+            "CQL's largest matrix product: oneDNN vs torch.bmm",
+            side("product", way="onednn"),
+            side("product", way="bmm"),
+        ),
+        Row(
             f"recording with {n} workers vs SB3 predict + Minari DataCollector",
             side("record", workers=n),
             side("sb3_collector"),

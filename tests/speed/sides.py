@@ -78,6 +78,23 @@ def products(algorithm: str) -> Work:
     return work
 
 
+def product(way: str) -> Work:
+    """The largest product of CQL's critics, 2 x [7680, 256] @ [256, 256]; a unit is one."""
+    import torch
+
+    torch.set_num_threads(1)
+    a, b, out = torch.randn(2, 7680, 256), torch.randn(2, 256, 256), torch.empty(2, 7680, 256)
+
+    def work() -> int:
+        if way == "onednn":
+            _onednn(a, b)
+        else:
+            torch.bmm(a, b.mT, out=out)
+        return 1
+
+    return work
+
+
 def _onednn(a: Any, b: Any) -> None:
     """[copies, m, k] @ [copies, n, k]^T by oneDNN, one copy after the other."""
     import torch
