@@ -280,6 +280,7 @@ SIDES: dict[str, Callable[..., Work]] = {
     for side in (
         train,
         products,
+        product,
         record,
         sb3_collector,
         physics,
