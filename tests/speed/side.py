@@ -61,5 +61,7 @@ class Side:
     def close(self) -> None:
         """Hang up."""
         assert self.process.stdin is not None
+        assert self.process.stdout is not None
         self.process.stdin.close()
         self.process.wait()
+        self.process.stdout.close()
