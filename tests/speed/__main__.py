@@ -45,8 +45,9 @@ def measure(row: Row, quick: bool) -> dict[str, Any]:
 
 
 def environment() -> dict[str, str]:
-    """One thread a process, whatever it computes with."""
-    return os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    """One thread a process, whatever it computes with; this package is found from any folder."""
+    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    return os.environ | one | {"PYTHONPATH": str(DOCS.parent)}
 
 
 def line(found: dict[str, Any]) -> list[str]:
