@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from offbench.errors import OffbenchError
-from offbench.ladder import Ladder, build_ladder, check_place
+from offbench.ladder import Ladder
 from offbench.recipes import Recipe, load_recipe
 from offbench.sac import Training, train
+from offbench.selection import build_ladder, check_place
 from offbench.workers import default_workers
 
 

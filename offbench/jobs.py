@@ -25,11 +25,11 @@ from offbench.batches import Member
 from offbench.errors import OffbenchError
 from offbench.progress import Progress
 from offbench.registry import load_algorithm
-from offbench.rollout import quiet_start, start_worker
 from offbench.runs import Run
 from offbench.settings import build
 from offbench.training import Report, Schedule, Trainer
 from offbench.transitions import Transitions
+from offbench.workers import quiet_start, start_worker
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,10 @@ neither the number of workers nor the task it fell into can change it. Workers n
 from __future__ import annotations
 
 import collections
-import contextlib
 import functools
 import multiprocessing
 import os
-import signal
-import sys
 import threading
-import time
-import types
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -35,10 +30,10 @@ from offbench.errors import OffbenchError
 from offbench.policy import Array, Policy, from_bytes
 from offbench.scores import interval
 from offbench.seeds import Purpose
+from offbench.workers import quiet_start, start_worker
 
 LANES = 8  # episodes that share a policy forward
 TASK = 16  # episodes that travel together
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 NOISE_BLOCK = 1024  # actions whose noise is drawn at once
 
 
@@ -295,44 +290,3 @@ def _gather(futures: Sequence[Future[Any]]) -> Future[list[Outcome]]:
     for future in futures:
         future.add_done_callback(arrived)
     return whole
-
-
-@contextlib.contextmanager
-def quiet_start() -> Iterator[None]:
-    """Let a worker start undisturbed: submitting a task may start one.
-
-    Ctrl-C is held back meanwhile (half a start would leave the pool unusable), and the user's script is hidden: a
-    spawned process would run it again, and a worker needs nothing of it. A worker gets one thread for its matrix
-    products: as many threads as cores in each of as many workers made recording several times slower.
-    """
-    masks = hasattr(signal, "pthread_sigmask")
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
-    script = sys.modules["__main__"]
-    sys.modules["__main__"] = types.ModuleType("__main__")
-    threads = {name: "1" for name in THREADS if name not in os.environ}
-    os.environ |= threads
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = script
-        for name in threads:
-            del os.environ[name]
-        if masks:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def start_worker(parent: int) -> None:
-    """Leave Ctrl-C to the parent, and end when the parent is gone (even by kill -9)."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
-
-
-def loaded(names: Sequence[str]) -> list[str]:
-    """Return which of these modules this process has loaded (a worker should have no PyTorch)."""
-    return [name for name in names if name in sys.modules]
-
-
-def _watch(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)

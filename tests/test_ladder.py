@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from offbench.errors import OffbenchError
-from offbench.ladder import Ladder, Rung, Surveyor, read_ladder
+from offbench.ladder import Ladder, Rung, read_ladder
 from offbench.levels import Part, parse_level, parse_mix, shares
+from offbench.selection import Surveyor
 
 
 def surveyor(returns: list[float], spread: float = 5.0) -> Surveyor:
