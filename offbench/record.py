@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,9 @@ from offbench.rollout import Episode, Rollouts
 from offbench.workers import default_workers
 
 WAIT = 5.0  # seconds between two looks at a dataset that another process records
+# What of the metadata makes two recordings the same one, with the versions that shape what an episode is.
+WHAT_IT_IS = ("env", "level", "seed", "recipe_sha256", "parts", "references")
+PHYSICS = ("mujoco", "gymnasium", "numpy")
 HOME = "https://github.com/offbench/offbench"
 
 
@@ -54,7 +58,8 @@ def collect(
         seed: of the recorded episodes. The same seed gives the same content for any number of workers.
         workers: recording processes (default: one a core).
         dataset_id: the Minari id; default `<env>-<level>-v<version>`.
-        overwrite: replace a dataset of that id.
+        overwrite: replace a dataset of that id. Without it, the same dataset recorded again is left as it is, and
+            another one is an error.
         retrain: use a behaviour agent trained here instead of the shipped one.
         behaviour_dir: where agents trained here live.
 
@@ -70,12 +75,19 @@ def collect(
     if steps is not None and steps < 1:
         raise OffbenchError(f"steps must be at least 1, not {steps}")
     workers = default_workers(workers)
-    with dataset.claimed(dataset_id, overwrite) as path:
-        ladder = _ladder(recipe, Path(behaviour_dir), retrain, workers)
+
+    def prepared(ladder: Ladder) -> tuple[_Recording, list[Rung | None], list[int], dict[str, Any]]:
         recording = _Recording(recipe, ladder, seed, workers)
         sources = [recording.source(part) for part in parts]
         counts = _counts(recipe, ladder, parts, steps)
-        metadata = _metadata(recording, dataset_id, mix or level, parts, sources, counts)
+        return recording, sources, counts, _metadata(recording, dataset_id, mix or level, parts, sources, counts)
+
+    ladder = _known_ladder(recipe, Path(behaviour_dir), retrain)
+    if ladder and not overwrite and dataset.exists(dataset_id) and _is(dataset_id, prepared(ladder)[-1]):
+        print(f"offbench: {dataset_id} is recorded already, from the same policies and seed", file=sys.stderr)
+        return dataset_id
+    with dataset.claimed(dataset_id, overwrite) as path:
+        recording, sources, counts, metadata = prepared(ladder or _train(recipe, Path(behaviour_dir), workers))
         total = sum(counts)
         with Progress(total, f"recording {dataset_id}") as progress:
             streams = (recording.episodes(*item) for item in zip(parts, sources, counts, itertools.count()))
@@ -109,20 +121,36 @@ def record_source(source: Source, workers: int) -> None:
             time.sleep(WAIT)
 
 
-def _ladder(recipe: Recipe, behaviour_dir: Path, retrain: bool, workers: int) -> Ladder:
-    """Return the shipped ladder, else the one trained here, else train it now."""
+def _is(dataset_id: str, wanted: Mapping[str, Any]) -> bool:
+    """Return whether a dataset was recorded from what `wanted`, its metadata to be, says, on this physics."""
+    known, ours = (dataset.provenance(found) for found in (dataset.read_metadata(dataset_id), dict(wanted)))
+    ours = json.loads(json.dumps(ours))  # as it was written: tuples are lists
+    made = [{name: part.get("versions", {}).get(name) for name in PHYSICS} for part in (known, ours)]
+    return all(known.get(key) == ours[key] for key in WHAT_IT_IS) and made[0] == made[1]
+
+
+def _known_ladder(recipe: Recipe, behaviour_dir: Path, retrain: bool) -> Ladder | None:
+    """Return the shipped ladder, else the one trained here, else None."""
     shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder and not retrain else None
     if shipped:
         shipped.check(recipe)
         warn_other_physics(f"the behaviour agent of {recipe.name}", shipped.info.get("versions", {}))
         return shipped
-    from offbench.agents import behaviour, folder_of  # imports PyTorch
+    from offbench.agents import folder_of  # imports PyTorch
 
     local = read_ladder(folder_of(recipe, 0, behaviour_dir) / "ladder")
-    if local:
-        print(f"offbench: using the behaviour agent trained here: {local.folder}", file=sys.stderr)
-        warn_other_physics(f"the behaviour agent of {recipe.name}", local.info.get("versions", {}))
-        return local.check(recipe)
+    if local is None:
+        return None
+    print(f"offbench: using the behaviour agent trained here: {local.folder}", file=sys.stderr)
+    warn_other_physics(f"the behaviour agent of {recipe.name}", local.info.get("versions", {}))
+    return local.check(recipe)
+
+
+def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:
+    """Train the recipe's behaviour agent now."""
+    from offbench.agents import behaviour
+
+    recipe.env_spec()  # refuses a bad environment before an hour is announced
     gradient, steps = recipe.sac.steps * recipe.sac.gradient_steps, recipe.sac.steps
     print(
         f"offbench: {recipe.name} has no behaviour agent yet; training SAC for {steps:,} steps first, "
@@ -165,7 +193,15 @@ class _Recording:
         if part.source in ("uniform", "replay"):
             return None
         if part.source in ("medium", "expert"):
-            return self.ladder.role(part.source)
+            rung = self.ladder.role(part.source)
+            fraction = self.ladder.fraction(rung)
+            if part.source == "medium" and not MEDIUM <= round(fraction, 2) <= MEDIUM_AT_MOST:
+                print(
+                    f"offbench: medium of {self.recipe.name} lies at {fraction:.2f} of the expert's return: "
+                    f"no rung of the training lies from {MEDIUM:.2f} to {MEDIUM_AT_MOST}",
+                    file=sys.stderr,
+                )
+            return rung
         rung = self.ladder.nearest(float(part.source))
         print(
             f"offbench: the rung nearest {part.source} is the one of step {rung.step:,}: return {rung.ret:.0f}, "

@@ -184,6 +184,22 @@ def test_a_failed_recording_leaves_the_old_dataset(tiny: tuple[str, str], monkey
     assert [p.name for p in dataset.root().iterdir() if not p.name.endswith(".lock")] == [name]
 
 
+def test_the_same_dataset_again_is_left_as_it_is(tiny: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    recipe, behaviour_dir = tiny
+
+    def collect(**arguments: Any) -> str:
+        return offbench.collect(recipe, "random", behaviour_dir=behaviour_dir, workers=1, **arguments)
+
+    name = collect(steps=50)
+    before = (dataset.path_of(name) / "data" / "main_data.hdf5").stat().st_mtime_ns
+    assert collect(steps=50) == name
+    assert "recorded already" in capsys.readouterr().err
+    assert (dataset.path_of(name) / "data" / "main_data.hdf5").stat().st_mtime_ns == before
+    for other in ({"steps": 60}, {"steps": 50, "seed": 1}):
+        with pytest.raises(OffbenchError, match="exists already"):
+            collect(**other)
+
+
 @pytest.mark.parametrize("moment", ["before", "after"])
 def test_a_replacement_that_fails_at_the_last_moment_keeps_the_old_dataset(
     tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch, moment: str
