@@ -147,6 +147,10 @@ def _check(recipe: Recipe, where: str) -> None:
     sac = recipe.sac
     if not sac.cycle()[1]:
         raise OffbenchError(f"{where}: [sac] gradient_steps x envs must be at least 1/64")
+    if sac.learning_starts >= sac.steps:
+        raise OffbenchError(
+            f"{where}: [sac] learning_starts {sac.learning_starts:,} leaves none of {sac.steps:,} steps to learn in"
+        )
     turn = sac.cycle()[0] * sac.envs
     if sac.segment % turn:
         raise OffbenchError(f"{where}: [sac] segment must be a multiple of {turn} (envs x the steps of a turn)")

@@ -15,6 +15,7 @@ import json
 import sys
 import time
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -83,14 +84,25 @@ def _claim(training: Training) -> None:
     identity["sac"] = recipe["sac"] | {"hidden": list(recipe["sac"]["hidden"])}
     path = training.folder / "training.json"
     if path.exists():
-        known = {key: read_json(path).get(key) for key in identity}
-        if known != json.loads(json.dumps(identity)):
+        begun = {key: value for key, value in read_json(path).items() if key in identity}
+        known, wanted = _flat(begun), _flat(json.loads(json.dumps(identity)))
+        other = [key for key in known | wanted if known.get(key) != wanted.get(key)]
+        if other:
+            was, is_ = (table.get(other[0], "none") for table in (known, wanted))
             raise OffbenchError(
-                f"{training.folder} holds a training of another recipe or seed; "
-                "delete it or give another --behaviour-dir"
+                f"{training.folder} holds another training, with {other[0]} {was}, not {is_}; delete it to train anew "
+                "(to train on, keep the recipe: `offbench behaviour ENV --steps N`)"
             )
         return
     write_json(path, identity | {"recipe_sha256": training.recipe.sha256(), "versions": versions()} | hardware())
+
+
+def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return {"sac.steps": ...} of {"sac": {"steps": ...}}."""
+    inner = {
+        f"{key}.{name}": v for key, value in table.items() if isinstance(value, dict) for name, v in value.items()
+    }
+    return inner | {key: value for key, value in table.items() if not isinstance(value, dict)}
 
 
 def _train(training: Training, steps: int) -> None:

@@ -139,7 +139,8 @@ def build_ladder(training: Training, steps: int, out: Path, workers: int, comman
         worst, best = references["random"]["return"], references["expert"]["return"]
         if best <= worst:
             raise OffbenchError(
-                f"after {steps} steps no rung beats the random policy ({best:.1f} against {worst:.1f}): train longer"
+                f"after {steps:,} steps no rung beats the random policy: the best returns {best:.1f} over "
+                f"{episodes} fresh episodes, random {worst:.1f}; train on with `offbench behaviour ENV --steps N`"
             )
         medium = surveyor.medium(worst + MEDIUM * (best - worst), worst + MEDIUM_AT_MOST * (best - worst), expert)
         parts = training.recipe.measure.rungs

@@ -15,6 +15,7 @@ import pytest
 import offbench
 from offbench import dataset
 from offbench.cli import main
+from offbench.errors import OffbenchError
 from tests.conftest import TINY_RECIPE
 from tests.test_transitions import episode, foreign
 
@@ -176,6 +177,10 @@ RECIPES: dict[str, tuple[str, str]] = {
     "name": ('env_id = "Hopper-v5"\nname = "../x"', "name may hold letters"),
     "half a reference": ('env_id = "Hopper-v5"\nd4rl_min = 1.0', "both d4rl_min and d4rl_max"),
     "segment": ('env_id = "Hopper-v5"\n[sac]\nsegment = 30\nenvs = 4', "segment must be a multiple of 4"),
+    "nothing to learn in": (
+        'env_id = "Hopper-v5"\n[sac]\nsteps = 4000',
+        "learning_starts 10,000 leaves none of 4,000 steps",
+    ),
     "unknown env": ('env_id = "Hoper-v5"', "cannot make the environment 'Hoper-v5'"),
     "discrete env": ('env_id = "CartPole-v1"', "actions must be a Box space, not Discrete(2)"),
     "env argument": ('env_id = "Hopper-v5"\n[env_kwargs]\nlegs = 3', "cannot make the environment"),
@@ -286,3 +291,11 @@ def test_a_policy_for_another_environment(medium: str, capsys: pytest.CaptureFix
     settings: dict[str, Any] = {"hidden": (8,), "batch_size": 8, "eval_every": 10, "eval_episodes": 1}
     (folder,) = offbench.train("td3_bc", medium, steps=10, **settings)
     assert "takes observations (4,)" in refusal(["evaluate", str(folder), "--env", "hopper"], capsys)
+
+
+def test_a_changed_recipe_is_another_training(tiny: tuple[str, str], home: Path) -> None:
+    """The message names what differs, and how to train on."""
+    text = Path(tiny[0]).read_text().replace("steps = 2400", "steps = 3200")
+    (home / "tiny.toml").write_text(text)
+    with pytest.raises(OffbenchError, match=r"sac\.steps 2400, not 3200; .*offbench behaviour ENV --steps N"):
+        offbench.behaviour("./tiny.toml", behaviour_dir=tiny[1])

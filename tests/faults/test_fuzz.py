@@ -174,7 +174,9 @@ RECIPE = (
 RECIPE += (
     b"[env_kwargs]\nframe_skip = 4\n[sac]\nsteps = 4000\nsegment = 400\nenvs = 4\nhidden = [16, 16]\ntau = 0.01\n"
 )
-RECIPE += b"gradient_steps = 0.5\nlearning_rate = 1e-3\n[measure]\nrung_episodes = 8\nrungs = 4\n"
+RECIPE += (
+    b"learning_starts = 100\ngradient_steps = 0.5\nlearning_rate = 1e-3\n[measure]\nrung_episodes = 8\nrungs = 4\n"
+)
 
 
 def _policy() -> bytes:
