@@ -74,6 +74,16 @@ def test_shown_parts_of_files_are_there_word_for_word() -> None:
         assert block.content in (DOCS / block.note.removeprefix("part of ")).read_text(), block
 
 
+def test_the_pages_commands_agree_so_that_one_may_go_from_page_to_page() -> None:
+    """The same small dataset and the same evaluations everywhere, or the second page would be refused."""
+    text = "\n".join(block.content for page in pages() for block in blocks(page) if not block.reason)
+    collected = re.findall(r"(?:collect inverted-pendulum --level medium|\"inverted-pendulum\", \"medium\",).*", text)
+    assert len(collected) > 5
+    assert {re.search(r"steps[ =](\d+)", line)[1] for line in collected} == {"5000"}  # type: ignore[index]
+    assert set(re.findall(r"eval.every[ =](\d+)", text)) == {"100"}
+    assert "--eval-episodes" not in text
+
+
 def test_links_lead_somewhere() -> None:
     count = 0
     for page in pages():
