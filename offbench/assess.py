@@ -21,6 +21,7 @@ from offbench.rollout import Rollouts, result
 from offbench.runs import Run
 from offbench.scores import interval, normalize
 from offbench.seeds import Purpose, generator
+from offbench.wording import counted
 from offbench.workers import default_workers
 
 
@@ -43,7 +44,7 @@ class Evaluation:
         """Return the evaluation as text."""
         mean, low, high = interval(self.returns)
         lines = [
-            f"{self.policy} in {self.env_id}: {len(self.returns)} episodes",
+            f"{self.policy} in {self.env_id}: {counted(len(self.returns), 'episode')}",
             f"return {mean:.1f} (95% interval {low:.1f} to {high:.1f}), std {np.std(self.returns):.1f}, "
             f"length {np.mean(self.lengths):.0f}",
         ]

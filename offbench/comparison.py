@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from offbench.errors import OffbenchError, unknown
-from offbench.results import REFERENCES, Entry, Results, read_results
+from offbench.results import REFERENCES, Entry, Results, Task, Trained, read_results
 from offbench.statistics import Estimate, Paired, improvement, paired
+from offbench.wording import counted
 
 LEVEL = 0.05  # a difference is evidence below this p, if its interval leaves out 0 too
 
@@ -59,11 +60,10 @@ class Comparison:
         over = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
         over += " seed" if counts[-1] == 1 else " seeds"
         over += f" on {len(sizes)} datasets" if len(sizes) > 1 else ""
-        low, high = estimate.low, estimate.high
-        if low is None or high is None or low <= 0 <= high or self.statistics.p > LEVEL:
+        sign = favoured(self.statistics)
+        if not sign:
             return f"no evidence of a difference at {over}"
-        better, value = (self.a, estimate) if low > 0 else (self.b, Estimate(-estimate.value, -high, -low))
-        return f"{better} is better: +{value} at {over}"
+        return f"{self.a if sign > 0 else self.b} is better: +{estimate if sign > 0 else -estimate} at {over}"
 
     def lines(self) -> list[str]:
         """Return the comparison as text."""
@@ -71,10 +71,8 @@ class Comparison:
         effect = "-" if found.standardised is None else f"{found.standardised:+.2f}"
         percent = self.chance.percent()
         lines = [f"{self.a} against {self.b} ({self.reference})", ""]
-        width = max(len(pair.dataset) for pair in self.pairs)
-        for p in self.pairs:
-            lines.append(f"{p.dataset:<{width}}  seed {p.seed:<3} {p.a:>8.1f} {p.b:>8.1f}  {p.a - p.b:>+8.1f}")
         lines += [
+            *self._pair_lines(),
             "",
             f"mean difference             {found.difference.value:+.1f} {found.difference.span()}".rstrip(),
             f"standardised                {effect} (over the deviation of the {found.pairs} paired differences)",
@@ -87,8 +85,21 @@ class Comparison:
         if self.unfinished:
             lines.append(f"note: {self.unfinished} of the paired runs did not reach their last step")
         if self.unpaired:
-            lines.append(f"note: {self.unpaired} runs have no partner of the same dataset and seed and are left out")
+            verbs = ("has", "is") if self.unpaired == 1 else ("have", "are")
+            lines.append(
+                f"note: {counted(self.unpaired, 'run')} {verbs[0]} no partner of the same dataset and seed "
+                f"and {verbs[1]} left out"
+            )
         return [*lines, "", self.verdict]
+
+    def _pair_lines(self) -> list[str]:
+        """Return the scores of each pair below a header that says whose they are."""
+        header = ["dataset", "seed", self.a, self.b, "difference"]
+        rows = [[p.dataset, str(p.seed), f"{p.a:.1f}", f"{p.b:.1f}", f"{p.a - p.b:+.1f}"] for p in self.pairs]
+        widths = [max(len(line[i]) for line in [header, *rows]) for i in range(len(header))]
+        return [
+            "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]) for line in [header, *rows]
+        ]
 
     def row(self) -> dict[str, Any]:
         """Return the comparison as JSON has it."""
@@ -127,30 +138,54 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
     groups = select(results, a), select(results, b)
     if groups[0] == groups[1]:
         raise OffbenchError(f"{a} and {b} are the same runs; give two groups")
-    left, right = ({(entry.task, t.seed): t for entry in group for t in entry.runs} for group in groups)
-    both = [key for key in left if key in right]
+    both = partners(*groups)
     if not both:
         raise OffbenchError(f"{a} and {b} share no dataset with a seed in common: there is nothing to pair")
-    tasks = {task for task, _ in both}
+    tasks = {task for task, *_ in both}
     if len(tasks) > 1 and any(task.reference is None for task in tasks):
         raise OffbenchError(
             "a dataset without reference scores has raw returns, which do not average with other datasets' scores; "
             "give a --runs folder of one dataset"
         )
-    scores = [(left[key].score(key[0].reference), right[key].score(key[0].reference)) for key in both]
-    pairs = [Pair(task.name, seed, *found) for (task, seed), found in zip(both, scores, strict=True)]
-    trained = [[found[key] for key in both] for found in (left, right)]
+    pairs = [Pair(t.name, one.seed, one.score(t.reference), other.score(t.reference)) for t, one, other in both]
+    trained = [[one for _, one, _ in both], [other for *_, other in both]]
     return Comparison(
         groups[0][0].method.label,
         groups[1][0].method.label,
         pairs,
         " and ".join(sorted({REFERENCES[task.reference] for task in tasks})),
-        paired(_by_dataset(pairs, lambda pair: pair.a - pair.b)),
+        paired(differences(both)),
         improvement(_by_dataset(pairs, lambda pair: pair.a), _by_dataset(pairs, lambda pair: pair.b)),
-        len(left) + len(right) - 2 * len(both),
+        sum(len(entry.runs) for group in groups for entry in group) - 2 * len(both),
         tuple(sorted({t.reached for t in side}) for side in trained),
         sum(t.state != "finished" for side in trained for t in side),
     )
+
+
+Partners = Sequence[tuple[Task, Trained, Trained]]
+
+
+def partners(a: Iterable[Entry], b: Iterable[Entry]) -> Partners:
+    """Return the runs of A and of B that have the same dataset and seed, in order of A's."""
+    others = {(entry.task, trained.seed): trained for entry in b for trained in entry.runs}
+    mine = ((entry.task, trained) for entry in a for trained in entry.runs)
+    return [(task, one, others[task, one.seed]) for task, one in mine if (task, one.seed) in others]
+
+
+def differences(both: Partners) -> dict[str, list[float]]:
+    """Return {task: score of A's run minus score of B's, for each pair}."""
+    found: dict[str, list[float]] = {}
+    for task, one, other in both:
+        found.setdefault(task.name, []).append(one.score(task.reference) - other.score(task.reference))
+    return found
+
+
+def favoured(found: Paired) -> int:
+    """Return 1 if A is better, -1 if B is, 0 if there is no evidence: interval and sign-flip test must agree."""
+    low, high = found.difference.low, found.difference.high
+    if low is None or high is None or low <= 0 <= high or found.p > LEVEL:
+        return 0
+    return 1 if low > 0 else -1
 
 
 def _by_dataset(pairs: Iterable[Pair], value: Callable[[Pair], float]) -> dict[str, list[float]]:

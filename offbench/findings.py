@@ -6,6 +6,8 @@ import dataclasses
 import json
 from dataclasses import dataclass, field
 
+from offbench.wording import counted
+
 AGAIN = "record or download the dataset again"
 FAULTS: dict[str, tuple[str, str]] = {
     # code: (what it means, what to do)
@@ -122,11 +124,11 @@ class Report:
 
     def lines(self) -> list[str]:
         """Return the report as text."""
-        lines = [f"{self.dataset_id}: {self.transitions:,} transitions, {self.episodes:,} episodes"]
+        lines = [f"{self.dataset_id}: {counted(self.transitions, 'transition')}, {counted(self.episodes, 'episode')}"]
         for title, items in (("checked", self.checked), ("skipped", self.skipped), ("warning", self.warnings)):
             lines += [f"  {title}  {item}" for item in items]
         lines += [f"  FOUND    {finding.line()}" for finding in self.findings]
-        return [*lines, "nothing found" if self.ok else f"{len(self.findings)} findings"]
+        return [*lines, "nothing found" if self.ok else counted(len(self.findings), "finding")]
 
     def to_json(self) -> str:
         """Return the report as JSON."""

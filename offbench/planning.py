@@ -21,7 +21,8 @@ from offbench.levels import parse_level
 from offbench.progress import duration
 from offbench.recipes import Recipe, load_recipe
 from offbench.registry import load_algorithm
-from offbench.runs import run_folder, settings_dict, variant
+from offbench.runs import Run, run_folder, settings_dict, variant
+from offbench.wording import counted
 from offbench.workers import default_workers
 
 # What a large GPU is taken to do of a stack's small float32 products where there is none to measure: a seventh of an
@@ -75,6 +76,11 @@ class Benchmark:
             for seed in one.times.seeds
         ]
 
+    def begun(self) -> list[Run]:
+        """Return the grid's runs that there are; its folder may hold other grids' too."""
+        runs = [Run(Path(order.folder)) for one in self.variants for order in self.orders(one)]
+        return [run for run in runs if run.config_path.exists()]
+
     def missing(self) -> list[Source]:
         """Return the datasets that are not recorded yet."""
         here = set(dataset.local_ids())
@@ -122,8 +128,9 @@ def plan(bench: Benchmark) -> Iterator[str]:
     spec = next(iter(specs.values()))  # for the shapes, which differ little
     runs = {one: bench.orders(one) for one in bench.variants}
     left = {one: [order for order in orders if not _done(order, one.times)] for one, orders in runs.items()}
-    total, datasets = sum(map(len, runs.values())), len(bench.grid.datasets)
-    yield f"{bench.grid.name}: {datasets} datasets, {len(runs)} variants, {total} runs, {_count(left)} to train"
+    sizes = {"dataset": len(bench.grid.datasets), "variant": len(runs), "run": sum(map(len, runs.values()))}
+    words = ", ".join(counted(size, noun) for noun, size in sizes.items())
+    yield f"{bench.grid.name}: {words}, {_count(left)} to train"
     if not any(left.values()):
         return
     play = float(np.mean([step_seconds(spec) for spec in specs.values()]))

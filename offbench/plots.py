@@ -12,9 +12,9 @@ import numpy as np
 
 from offbench.errors import OffbenchError
 from offbench.files import write_bytes
-from offbench.runs import Run
+from offbench.runs import DIGITS, Run
 from offbench.scores import normalize
-from offbench.tables import evaluated_groups
+from offbench.tables import ambiguous, evaluated_groups
 
 FORMATS = ("png", "svg", "pdf")
 
@@ -52,18 +52,20 @@ def plot_curves(runs: str | Path, path: str | Path) -> Path:
         OffbenchError: there are no evaluated runs, or the picture cannot be written.
     """
     groups = evaluated_groups(runs)
-    datasets = list(dict.fromkeys(key[0] for key in groups))
+    twins = ambiguous(groups)
+    titles = {key: f"{key[0]} ({key[3][:DIGITS]})" if key[0] in twins else key[0] for key in groups}
+    datasets = list(dict.fromkeys(titles.values()))
     with figure(len(datasets)) as (fig, panels):
-        for (dataset_id, algorithm, variant, _), group in groups.items():
-            axes = panels[datasets.index(dataset_id)]
+        for key, group in groups.items():
+            axes = panels[datasets.index(titles[key])]
             pair = group[0][1]["references"]["dataset"]
             curves = [_curve(run, pair) for run, _ in group]
             steps = sorted(set.intersection(*(set(curve) for curve in curves)))
             values = np.array([[curve[step] for step in steps] for curve in curves])
-            name = f"{algorithm} {variant}".removesuffix(" default")
+            name = f"{key[1]} {key[2]}".removesuffix(" default")
             (line,) = axes.plot(steps, values.mean(0), marker="o", markersize=3, label=name)
             axes.fill_between(steps, values.min(0), values.max(0), color=line.get_color(), alpha=0.15, linewidth=0)
-            axes.set(title=dataset_id, xlabel="updates", ylabel="normalized score" if pair else "return")
+            axes.set(title=titles[key], xlabel="updates", ylabel="normalized score" if pair else "return")
         for axes in panels:
             axes.legend(frameon=False, fontsize="small")
         return save(fig, path)

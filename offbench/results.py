@@ -20,7 +20,7 @@ import numpy as np
 
 from offbench.errors import OffbenchError
 from offbench.levels import LEVELS
-from offbench.runs import Run, find_runs
+from offbench.runs import DIGITS, Run, find_runs
 from offbench.scores import LAST, mean_std, normalize, run_return
 
 # the order of the BDB paper's Table 1; levels are in its order already
@@ -47,7 +47,7 @@ class Task:
     @property
     def name(self) -> str:
         """The dataset's id, with its content's first digits where the id alone is ambiguous."""
-        return f"{self.dataset} ({self.content[:8]})" if self.twin else self.dataset
+        return f"{self.dataset} ({self.content[:DIGITS]})" if self.twin else self.dataset
 
     @property
     def place(self) -> tuple[str, str]:

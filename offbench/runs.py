@@ -24,6 +24,7 @@ from offbench.files import csv_bytes, read_json, write_bytes, write_json
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 FORMAT = "offbench-run-1"
+DIGITS = 8  # of a content hash, where a table must tell two contents of one dataset id apart
 REQUIRED = {  # what a config.json must hold, and of which kind
     **dict.fromkeys(("algorithm", "variant", "dataset", "dataset_sha256"), str),
     **dict.fromkeys(("seed", "steps"), int),

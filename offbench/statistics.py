@@ -43,6 +43,10 @@ class Estimate:
         """Return `[low, high]`, empty without an interval."""
         return "" if self.low is None or self.high is None else f"[{self.low:.1f}, {self.high:.1f}]"
 
+    def __neg__(self) -> Estimate:
+        low, high = (None if end is None else -end for end in (self.high, self.low))
+        return Estimate(-self.value, low, high)
+
     def percent(self) -> Estimate:
         """Return a fraction as a percentage."""
         low, high = (None if end is None else 100 * end for end in (self.low, self.high))

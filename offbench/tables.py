@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,12 @@ import numpy as np
 from offbench.errors import OffbenchError
 from offbench.ladder import read_ladder
 from offbench.recipes import load_recipe
-from offbench.runs import Run, find_runs
+from offbench.runs import DIGITS, Run, find_runs
 from offbench.scores import LAST, mean_std, normalize, run_return
 from offbench.statistics import iqm
 
 Row = dict[str, Any]
+Groups = dict[tuple[str, str, str, str], list[tuple[Run, dict[str, Any]]]]
 FORMATS = ("table", "json", "csv", "markdown", "latex")
 
 
@@ -27,12 +29,39 @@ def score_runs(runs: str | Path = "runs") -> list[Row]:
 
     A run's score is the mean of its last 10 evaluations; a row has the mean and the standard deviation over
     seeds, normalised by the dataset's own reference (`score`) and by D4RL's constants (`d4rl_score`), and the
-    interquartile mean of `score` with its 95% bootstrap interval (`iqm`, in JSON and CSV).
+    interquartile mean of `score` with its 95% bootstrap interval (`iqm`, in JSON and CSV). Only if one id stands for
+    several contents, rows have the first digits of the content's hash (`content`).
 
     Raises:
         OffbenchError: the folder holds no evaluated run, or a damaged one.
     """
-    return [_row(*key[:3], group) for key, group in evaluated_groups(runs).items()]
+    return _rows(evaluated_groups(runs))
+
+
+def score_some(runs: Iterable[Run]) -> list[Row]:
+    """Return the rows of `score_runs` for these runs alone; [] if none is evaluated."""
+    return _rows(_groups(runs))
+
+
+def count_waiting(rows: Sequence[Row], runs: str | Path) -> int:
+    """Return how many runs below a folder are not behind the rows of its table: they have no evaluation yet."""
+    return len(find_runs(Path(runs))) - sum(int(row["seeds"]) for row in rows)
+
+
+def _rows(groups: Groups) -> list[Row]:
+    rows = [_row(*key[:3], group) for key, group in groups.items()]
+    if not ambiguous(groups):
+        return rows
+    return [
+        {"dataset": row["dataset"], "content": content[:DIGITS], **row}
+        for (*_, content), row in zip(groups, rows, strict=True)
+    ]
+
+
+def ambiguous(groups: Groups) -> set[str]:
+    """Return the dataset ids that stand for more than one content: a dataset was recorded again."""
+    known = Counter(dataset for dataset, _ in {(key[0], key[3]) for key in groups})
+    return {dataset for dataset, count in known.items() if count > 1}
 
 
 def _row(dataset: str, algorithm: str, variant: str, group: list[tuple[Run, dict[str, Any]]]) -> Row:
@@ -88,23 +117,25 @@ def score_returns(env: str, returns: Sequence[float], behaviour_dir: str | Path 
     ]
 
 
-Groups = dict[tuple[str, str, str, str], list[tuple[Run, dict[str, Any]]]]
-
-
 def evaluated_groups(runs: str | Path) -> Groups:
     """Return the evaluated runs below a folder by (dataset, algorithm, variant, dataset content), sorted.
 
     Raises:
         OffbenchError: there are none, or one is damaged.
     """
+    groups = _groups(find_runs(Path(runs)))
+    if not groups:
+        raise OffbenchError(f"no evaluated runs below {runs}; start one with `offbench train ALGO --dataset ID`")
+    return groups
+
+
+def _groups(runs: Iterable[Run]) -> Groups:
     groups: Groups = {}
-    for run in find_runs(Path(runs)):
+    for run in runs:
         config = run.config()
         if run.evaluations():
             key = (config["dataset"], config["algorithm"], config["variant"], config["dataset_sha256"])
             groups.setdefault(key, []).append((run, config))
-    if not groups:
-        raise OffbenchError(f"no evaluated runs below {runs}; start one with `offbench train ALGO --dataset ID`")
     return dict(sorted(groups.items()))
 
 

@@ -23,6 +23,7 @@ from offbench.resimulate import Verdict, check
 from offbench.rollout import Rollouts, result
 from offbench.seeds import Purpose
 from offbench.survey import Survey, episodes_of, survey
+from offbench.wording import counted
 from offbench.workers import default_workers
 
 EPISODES = 300  # played again by default: half a minute for a million transitions
@@ -173,10 +174,11 @@ def _tell(verdicts: Sequence[Verdict], mujoco: str | None, report: Report, findi
         played = [verdict for verdict in verdicts if verdict.how == how]
         if played:
             steps = sum(verdict.steps for verdict in played)
-            report.checked.append(f"{len(played):,} episodes played again {words}: {steps:,} steps")
+            report.checked.append(f"{counted(len(played), 'episode')} played again {words}: {counted(steps, 'step')}")
     left = sum(verdict.how == "none" for verdict in verdicts)
     if left:
-        report.skipped.append(f"playing {left:,} episodes again: no seed, and no state to be set from observations")
+        words = f"playing {counted(left, 'episode')} again"
+        report.skipped.append(f"{words}: no seed, and no state to be set from observations")
     for verdict in verdicts:
         for code, detail in verdict.faults:
             findings.add(code, f"episode {verdict.index}", detail)

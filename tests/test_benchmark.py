@@ -27,6 +27,7 @@ from offbench.recipes import load_recipe
 from offbench.registry import load_algorithm
 from offbench.runs import Run, find_runs
 from offbench.tables import score_runs
+from tests.made_runs import made_run
 from tests.speed.arithmetic import ALGORITHMS
 
 GRID = """
@@ -85,10 +86,9 @@ def test_shipped_grids_are_sound_and_their_plan_counts_what_is_left(name: str) -
     bench = prepare(name, workers=2)
     first, *lines = plan(bench)
     runs = sum(len(bench.orders(one)) for one in bench.variants)
-    assert (
-        first
-        == f"{name}: {len(bench.grid.datasets)} datasets, {len(bench.variants)} variants, {runs} runs, {runs} to train"
-    )
+    datasets = len(bench.grid.datasets)
+    words = "1 dataset" if datasets == 1 else f"{datasets} datasets"
+    assert first == f"{name}: {words}, {len(bench.variants)} variants, {runs} runs, {runs} to train"
     assert any("to record first" in line for line in lines)
     assert "on 2 processes of one thread about" in lines[-2]
     assert "on a GPU: not measured here" in lines[-1]
@@ -118,6 +118,16 @@ def test_a_finished_grid_is_left_alone(grid: str, home: Path, capsys: pytest.Cap
     said = capsys.readouterr().out
     assert "4 runs, 0 to train" in said
     assert "td3_bc" in said.splitlines()[-1]
+
+
+def test_the_table_is_of_the_grids_runs(grid: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert benchmark(prepare(grid, workers=1), say=silent)
+    other = made_run(home / "runs", "hopper-medium-v0", "cql", "default", 0, 50)
+    main(["benchmark", grid, "--workers", "1"])
+    said = capsys.readouterr().out
+    assert "bdb" in said
+    assert "hopper-medium-v0" not in said
+    assert other.evaluations()
 
 
 def test_missing_datasets_are_recorded_first(home: Path) -> None:

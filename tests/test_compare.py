@@ -55,9 +55,21 @@ def test_only_what_both_have_is_paired(home: Path, capsys: pytest.CaptureFixture
     assert row["probability_of_improvement"] == 0.25
     main(["compare", "td3_bc", "cql"])
     text = capsys.readouterr().out
-    assert "note: 2 runs have no partner" in text
+    assert "note: 2 runs have no partner of the same dataset and seed and are left out" in text
     assert "mean difference             -2.5 [-4.0, -1.0]" in text
     assert text.splitlines()[-1] == "no evidence of a difference at 2 seeds"
+
+
+def test_the_scores_stand_below_whose_they_are(home: Path) -> None:
+    scores(home / "runs", "td3_bc", [51.0, 152.0, 7.0])
+    scores(home / "runs", "bdb", [50.0, 50.0], variant="beta=0.5")
+    lines = offbench.compare("td3_bc", "bdb/beta=0.5").lines()
+    assert lines[2:5] == [
+        "dataset           seed  td3_bc  bdb beta=0.5  difference",
+        "hopper-medium-v0     0    51.0          50.0        +1.0",
+        "hopper-medium-v0     1   152.0          50.0      +102.0",
+    ]
+    assert "note: 1 run has no partner of the same dataset and seed and is left out" in lines
 
 
 def test_one_seed_is_no_evidence(home: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import offbench
-from offbench import assess, reports
+from offbench import assess, transitions
 from offbench.cli import main
 from offbench.files import write_json
 from offbench.reports.tables import published
@@ -171,8 +171,28 @@ def test_a_dataset_recorded_twice_is_two_rows(home: Path) -> None:
     config = json.loads(run.config_path.read_text())
     write_json(run.config_path, config | {"dataset_sha256": "abcd1234ef"})
     offbench.report(home / "runs", home / "out")
-    assert len(rows(home / "out" / "tables" / "scores.csv")) == 2
-    assert "hopper-medium-v0 (abcd1234)" in (home / "out" / "index.html").read_text()
+    kinds = {kind: (home / "out" / "tables" / f"scores.{kind}").read_text() for kind in ("csv", "md", "tex")}
+    contents = ["00000000", "abcd1234"]
+    names = [row["environment"] for row in rows(home / "out" / "tables" / "scores.csv")]
+    assert names == [f"hopper ({content})" for content in contents]
+    for text in kinds.values():
+        assert all(text.count(f"hopper ({content})") == 1 for content in contents)
+    beside = rows(home / "out" / "tables" / "beside.csv")
+    assert [row["environment"] for row in beside] == names
+    page = (home / "out" / "index.html").read_text()
+    assert "hopper-medium-v0 (abcd1234)" in page
+    assert "the first digits of the content's hash" in kinds["md"]
+    made_run(home / "runs", "hopper-medium-v0", "cql", "default", 1, 50, reached=0)
+    offbench.report(home / "runs", home / "out")
+    assert rows(home / "out" / "tables" / "seeds.csv")[-1]["dataset"] == "hopper-medium-v0 (00000000)"
+
+
+def test_two_ids_of_one_level_are_told_apart(home: Path) -> None:
+    for dataset in ("hopper-medium-v0", "hopper-medium-v1", "hopper-random-v0"):
+        made_run(home / "runs", dataset, "td3_bc", "default", 0, 50)
+    offbench.report(home / "runs", home / "out")
+    names = [row["environment"] for row in rows(home / "out" / "tables" / "scores.csv")]
+    assert names == ["hopper", "hopper (hopper-medium-v0)", "hopper (hopper-medium-v1)"]
 
 
 def test_a_run_that_is_there_twice_is_refused(home: Path) -> None:
@@ -200,6 +220,63 @@ def test_a_real_training(medium: str, home: Path) -> None:
     ]
     written = json.loads((folders[-1] / "similarity.json").read_text())
     assert found["by Q (%)"] == f"{written['q_similar']:.1f} ± ?"
+
+
+def test_the_datasets_are_those_of_the_runs(medium: str, home: Path) -> None:
+    data = transitions.load(medium)
+    for algorithm, content in (("td3_bc", data.content), ("cql", "fedc" * 16)):
+        run = made_run(home / "runs", medium, algorithm, "default", 0, 50)
+        own = {"dataset_sha256": content, "env_id": data.env_id}
+        write_json(run.config_path, json.loads(run.config_path.read_text()) | own)
+    made_run(home / "runs", "my-data-v0", "td3_bc", "default", 0, 50)
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert "Datasets that the runs were trained on" in page.text
+    assert "Shipped cards" not in page.text  # none of these environments has one
+    found = {row["content"]: list(row.values()) for row in rows(home / "out" / "tables" / "datasets.csv")}
+    counts = [f"{len(data):,}", f"{len(data.ends):,}", f"{data.returns.mean():,.1f}"]
+    assert found[data.content[:12]] == [medium, "InvertedPendulum-v5", *counts, data.content[:12]]
+    # recorded again since, and not on this machine: nothing is known but what the runs say
+    assert found["fedcfedcfedc"] == [medium, "InvertedPendulum-v5", "-", "-", "-", "fedcfedcfedc"]
+    assert found["000000000000"] == ["my-data-v0", "Hopper-v5", "-", "-", "-", "000000000000"]
+
+
+@pytest.mark.parametrize("seeds", [2, 6])
+def test_bold_improvement_is_compares_verdict(home: Path, seeds: int) -> None:
+    for algorithm, value in (("td3_bc", 90.0), ("cql", 10.0)):
+        for seed in range(seeds):
+            run = made_run(home / "runs", "hopper-medium-v0", algorithm, "default", seed, 0)
+            run.write_evaluations({30_000: [(value + seed, 5)]})
+    offbench.report(home / "runs", home / "out")
+    evidence = "no evidence" not in offbench.compare("td3_bc", "cql").verdict
+    assert evidence == (seeds == 6)  # two seeds of one dataset have p = 1/2, six 1/32
+    lines = (home / "out" / "tables" / "improvement.md").read_text().splitlines()
+    certain = r"100 \[100, 100\]"
+    assert f"| td3\\_bc | - | {f'**{certain}**' if evidence else certain} |" in lines
+    assert r"| cql | 0 \[0, 0\] | - |" in lines
+    assert "with few seeds it covers less than 95%" in "".join(lines)
+
+
+def test_the_paper_is_named_where_its_numbers_are(home: Path) -> None:
+    made_run(home / "runs", "inverted-pendulum-medium-v0", "td3_bc", "default", 0, 50)
+    page = Page(offbench.report(home / "runs", home / "out"))
+    markdown = (home / "out" / "tables" / "scores.md").read_text()
+    assert markdown.startswith("## Scores\n")
+    assert "“paper”" not in page.text + markdown
+    assert "a single seed has no standard deviation" in markdown
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert (home / "out" / "tables" / "scores.md").read_text().startswith("## Scores (the BDB paper's Table 1)\n")
+    assert "“paper”: BDB paper, Table 1" in page.text
+    assert "Learning curves" in page.text
+    assert not [word for word in ("Table 1: ", "Table 2: ", "Figure 4: ") if word in page.text]
+
+
+def test_one_is_singular(home: Path) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, reached=10_000)
+    made_run(home / "runs", "hopper-medium-v0", "cql", "default", 0, 50, reached=0)
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert "1run1dataset1method1seed a cell" in page.text  # the tiles, one after another
+    assert "1 of 1 runs is unfinished. 1 more has no evaluation yet." in page.text
 
 
 def test_a_file_where_the_report_should_be(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -283,9 +360,10 @@ def test_a_shipped_dataset_card_is_shown(home: Path, monkeypatch: pytest.MonkeyP
     (home / "package" / "datasets" / "hopper" / "card.png").write_bytes(b"\x89PNG")
     made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
     made_run(home / "runs", "my-medium-v0", "td3_bc", "default", 0, 50)
-    monkeypatch.setattr(reports.importlib.resources, "files", lambda _: home / "package")
+    monkeypatch.setattr(importlib.resources, "files", lambda _: home / "package")
     page = Page(offbench.report(home / "runs", home / "out"))
     assert "hopper (mujoco 3.4.0)" in page.text
+    assert page.text.index("Datasets that the runs were trained on") < page.text.index("Shipped cards, for reference")
     assert "25.0%" in page.text
     pictures = [a for name, a in page.elements if name == "img"]
     assert len(pictures) == 1

@@ -55,8 +55,16 @@ def test_spread_over_seeds() -> None:
     assert mean_std([7.0]) == (7.0, None)
 
 
-def write_run(seed: int, returns: list[float], variant: str = "default", d4rl: Any = (-10.0, 190.0)) -> None:
-    run = Run(Path("runs") / "x-v0" / "bdb" / variant / f"seed-{seed}")
+def write_run(
+    seed: int,
+    returns: list[float],
+    variant: str = "default",
+    d4rl: Any = (-10.0, 190.0),
+    *,
+    runs: str = "runs",
+    content: str = "ab" * 32,
+) -> None:
+    run = Run(Path(runs) / "x-v0" / "bdb" / variant / f"seed-{seed}")
     config: dict[str, Any] = {
         "format": "offbench-run-1",
         "dataset": "x-v0",
@@ -65,10 +73,11 @@ def write_run(seed: int, returns: list[float], variant: str = "default", d4rl: A
         "seed": seed,
     }
     references = {"dataset": [0.0, 200.0], "d4rl": d4rl}
-    config |= {"settings": {}, "dataset_sha256": "ab" * 32, "eval_every": 100, "eval_episodes": 3}
+    config |= {"settings": {}, "dataset_sha256": content, "eval_every": 100, "eval_episodes": 3}
     run.folder.mkdir(parents=True)
     run.claim(config | {"references": references, "steps": 100})
-    run.write_evaluations({100: [(value, 3) for value in returns]})
+    if returns:
+        run.write_evaluations({100: [(value, 3) for value in returns]})
 
 
 def test_the_table_of_runs_by_hand() -> None:
@@ -109,6 +118,44 @@ def test_every_format_holds_every_number(style: str, capsys: pytest.CaptureFixtu
     if style == "latex":
         assert "d4rl\\_score" not in text
         assert text.count("\\\\") == 2
+
+
+@pytest.mark.parametrize("style", FORMATS)
+def test_two_contents_of_one_id_are_told_apart(style: str, capsys: pytest.CaptureFixture[str]) -> None:
+    write_run(0, [90.0], runs="runs/old", content="12345678" * 8)
+    main(["normalize", "--format", style])
+    assert "12345678" not in capsys.readouterr().out  # the id says it all
+    write_run(0, [30.0], runs="runs/new", content="9abcdef0" * 8)
+    main(["normalize", "--format", style])
+    text = capsys.readouterr().out
+    assert (text.count("12345678"), text.count("9abcdef0")) == (1, 1)
+    if style == "json":
+        assert [(row["dataset"], row["content"], row["score"]) for row in json.loads(text)] == [
+            ("x-v0", "12345678", 45.0),
+            ("x-v0", "9abcdef0", 15.0),
+        ]
+
+
+def test_a_picture_of_two_contents_has_two_panels(home: Path) -> None:
+    write_run(0, [90.0], runs="runs/old", content="12345678" * 8)
+    write_run(0, [30.0], runs="runs/new", content="9abcdef0" * 8)
+    svg = plot_curves("runs", home / "curves.svg").read_text()
+    assert "x-v0 (12345678)" in svg
+    assert "x-v0 (9abcdef0)" in svg
+
+
+def test_runs_without_an_evaluation_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
+    write_run(0, [90.0])
+    main(["normalize"])
+    assert capsys.readouterr().err == ""
+    for seed, words in ((1, "1 run has no evaluation yet"), (2, "2 runs have no evaluation yet")):
+        write_run(seed, [])
+        main(["normalize", "--format", "json"])
+        said = capsys.readouterr()
+        assert said.err == f"{words}\n"
+        assert json.loads(said.out)[0]["seeds"] == 1
+    main(["normalize", "--env", "hopper", "1000"])
+    assert capsys.readouterr().err == ""
 
 
 def test_one_seed_shows_no_spread() -> None:

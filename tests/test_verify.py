@@ -15,7 +15,7 @@ import offbench
 from offbench import dataset
 from offbench.cli import main
 from offbench.environments import env_spec
-from offbench.findings import FAULTS
+from offbench.findings import FAULTS, Finding, Report
 from offbench.levels import LEVELS
 from offbench.survey import episodes_of
 from offbench.transitions import open_minari
@@ -374,3 +374,10 @@ def test_workers_find_the_same(medium: str, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_every_code_has_words_and_a_remedy() -> None:
     assert all(what and remedy for what, remedy in FAULTS.values())
+
+
+def test_one_finding_is_singular() -> None:
+    finding = Finding("shape", "episode 0", "odd", "mend it", 1)
+    assert Report("a-v0", 1, 1, (finding,)).lines()[-1] == "1 finding"
+    assert Report("a-v0", 1, 1).lines()[0] == "a-v0: 1 transition, 1 episode"
+    assert Report("a-v0", 1000, 2, (finding, finding)).lines()[-1] == "2 findings"

@@ -20,9 +20,15 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--plot", metavar="PICTURE", help="also draw the learning curves (.png, .svg, .pdf)")
 
     def run(style: str, plot: str | None, **arguments: Any) -> None:
-        from offbench.tables import normalize_runs_or_returns, render
+        from offbench.tables import count_waiting, normalize_runs_or_returns, render
+        from offbench.wording import counted
 
-        print(render(normalize_runs_or_returns(**arguments), style))
+        rows = normalize_runs_or_returns(**arguments)
+        print(render(rows, style))
+        waiting = 0 if arguments["env"] else count_waiting(rows, arguments["runs"])
+        if waiting:
+            verb = "has" if waiting == 1 else "have"
+            print(f"{counted(waiting, 'run')} {verb} no evaluation yet", file=sys.stderr)
         if plot:
             from offbench.plots import plot_curves
 

@@ -103,8 +103,8 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
             arguments["workers"] = arguments["workers"] or where.cpus
         bench = planning.prepare(**arguments)
         finished = benchmark(bench, budget=budget, shard=shard, executor=where, command=command)
-        if any(bench.runs.rglob("evaluations.csv")):  # a small budget ends before there are any
-            print(tables.render(tables.score_runs(bench.runs)))
+        if rows := tables.score_some(bench.begun()):  # a small budget ends before there are any
+            print(tables.render(rows))
         if not finished:
             print("stopped at the budget; the same command goes on", file=sys.stderr)
 

@@ -9,29 +9,28 @@ The same runs give the same bytes.
 
 from __future__ import annotations
 
-import base64
-import importlib.resources
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from offbench.errors import OffbenchError
-from offbench.files import read_json, write_bytes
+from offbench.files import write_bytes
 from offbench.reports import figures as draw
 from offbench.reports import tables
+from offbench.reports.datasets import cards, dataset_table
 from offbench.reports.figures import Figure, Line
-from offbench.reports.layout import Cell, Table, files
+from offbench.reports.layout import Table, files
 from offbench.reports.markup import Markup, join, tag
 from offbench.reports.page import Section, boxes, figures, page, relative, table
 from offbench.reports.similarity import similarity_tables
 from offbench.reports.tables import scale
 from offbench.results import Entry, Method, Results, read_results
+from offbench.wording import counted, plural
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="offbench">'  # by which an older report is known
-STATES = {"unfinished": "are unfinished", "diverged": "diverged"}
+STATES = {"unfinished": ("is unfinished", "are unfinished"), "diverged": ("diverged", "diverged")}
 
 
 def report(runs: str | Path = "runs", out: str | Path = "report") -> Path:
@@ -79,7 +78,8 @@ def _older(folder: Path) -> set[Path]:
 
 
 def _tables(results: Results) -> dict[str, Table]:
-    known = [tables.score_table(results), tables.seed_table(results), *similarity_tables(results)]
+    known = [tables.score_table(results), tables.seed_table(results), dataset_table(results)]
+    known += similarity_tables(results)
     beside = tables.beside_table(results)
     aggregates = tables.iqms(results)
     if beside:
@@ -87,7 +87,7 @@ def _tables(results: Results) -> dict[str, Table]:
     if aggregates:
         known.append(tables.iqm_table(results, aggregates))
     if len(aggregates) > 1:
-        known.append(tables.improvement_table(aggregates))
+        known.append(tables.improvement_table(results, aggregates))
     return {one.name: one for one in known}
 
 
@@ -131,18 +131,19 @@ def _lead(results: Results) -> Markup:
     runs = [trained for entry in entries for trained in entry.runs]
     seeds = sorted({len(entry.runs) for entry in entries})
     states = Counter(trained.state for trained in runs)
-    counts = {
-        "runs": f"{len(runs)}",
-        "datasets": f"{len(results.tasks)}",
-        "methods": f"{len(results.methods)}",
-        "seeds a cell": f"{seeds[0]}" if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}",
-        "updates trained": f"{sum(trained.reached for trained in runs):,}",
-    }
-    tiles = [tag("li", tag("b", value), tag("span", name)) for name, value in counts.items()]
-    told = [f"{states[name]} of {len(runs)} runs {verb}." for name, verb in STATES.items() if states[name]]
+    each = f"{seeds[0]}" if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+    counts = [
+        (f"{len(runs)}", plural(len(runs), "run")),
+        (f"{len(results.tasks)}", plural(len(results.tasks), "dataset")),
+        (f"{len(results.methods)}", plural(len(results.methods), "method")),
+        (each, f"{plural(seeds[-1], 'seed')} a cell"),
+        (f"{sum(trained.reached for trained in runs):,}", "updates trained"),
+    ]
+    tiles = [tag("li", tag("b", value), tag("span", name)) for value, name in counts]
+    told = [f"{count} of {len(runs)} runs {STATES[name][count > 1]}." for name in STATES if (count := states[name])]
     state = " ".join(told) or "All runs are finished."
     if results.waiting:
-        state += f" {len(results.waiting)} more have not been evaluated yet."
+        state += f" {len(results.waiting)} more {'has' if len(results.waiting) == 1 else 'have'} no evaluation yet."
     words = f"{scale(results)} {state}"
     return join(tag("p", words, class_="lead"), tag("ul", *tiles, class_="tiles"))
 
@@ -151,19 +152,20 @@ def _sections(
     results: Results, found: Mapping[str, Table], pictures: Mapping[str, Sequence[Figure]]
 ) -> Iterator[Section]:
     words = "Click a number to see where it comes from: seeds, commands, versions, hardware. Click a header to sort."
-    yield Section("scores", "Table 1: scores", [table(found["scores"])], words)
+    yield Section("scores", found["scores"].title, [table(found["scores"])], words)
     if "iqm" in found:
         parts = [figures(pictures["iqm"]), table(found["iqm"])]
         yield Section("aggregate", "Across datasets", parts)
     if "improvement" in found:
         yield Section("improvement", "Probability of improvement", [table(found["improvement"])])
-    yield Section("curves", "Figure 4: learning curves", [figures(pictures["curves"])])
+    words = "The BDB paper's Figure 4 shows the same of its datasets."
+    yield Section("curves", "Learning curves", [figures(pictures["curves"])], words)
     yield Section("finals", "Final scores, seed by seed", [figures(pictures["finals"])])
     if "beside" in found:
         yield Section("beside", "Beside published numbers", [table(found["beside"])])
     if "similarity" in found:
         more = tag("details", tag("summary", "Both readings"), table(found["similarity-details"]))
-        yield Section("similarity", "Table 2: similar score", [table(found["similarity"]), more])
+        yield Section("similarity", found["similarity"].title, [table(found["similarity"]), more])
     if pictures["beta"]:
         words = "BDB's weight of the discriminator against cloning: 0 is TD3+BC, 1 the discriminator alone."
         yield Section("beta", "Beta over training", [figures(pictures["beta"])], words)
@@ -172,52 +174,22 @@ def _sections(
             "Mean |Q1| on the dataset's own actions. A critic that diverges is seen here before the score shows it."
         )
         yield Section("critic", "Critic over training", [figures(pictures["q"])], words)
-    cards = [_card(env) for env in dict.fromkeys(task.place[0] for task in results.tasks)]
-    if any(cards):
-        yield Section("datasets", "Datasets", [card for card in cards if card], "As shipped with the package.")
-    every = tag("details", tag("summary", f"All {len(found['seeds'].rows)} runs"), table(found["seeds"]))
+    yield Section("datasets", "Datasets", [table(found["datasets"]), *_shipped(results)])
+    summary = f"Show {counted(len(found['seeds'].rows), 'run')}"
+    every = tag("details", tag("summary", summary), table(found["seeds"]))
     yield Section("runs", "Every run", [every, _waiting(results)])
+
+
+def _shipped(results: Results) -> list[Markup]:
+    shown = cards(results)
+    words = (
+        "What the shipped recipes of these environments record, whole; the runs were trained on the datasets above."
+    )
+    return [tag("h3", "Shipped cards, for reference"), tag("p", words, class_="note"), *shown] if shown else []
 
 
 def _waiting(results: Results) -> Markup:
     if not results.waiting:
         return join()
     names = [tag("li", relative(results, run)) for run in results.waiting]
-    return join(tag("p", "Begun, not evaluated yet, and in no table above:"), tag("ul", *names))
-
-
-def _card(env: str) -> Markup | None:
-    """Return an environment's shipped dataset card, None where there is none."""
-    if not re.fullmatch(r"[a-z0-9_-]+", env):
-        return None
-    folder = importlib.resources.files("offbench") / "datasets" / env
-    card, picture = Path(str(folder / "card.json")), Path(str(folder / "card.png"))
-    if not card.exists():
-        return None
-    known = read_json(card)
-    rows = [[Cell(level), *map(_fact, _facts(values))] for level, values in known["levels"].items()]
-    header = ["level", "transitions", "episodes", "mean return", "std", "score", "terminated", "content"]
-    made = ", ".join(f"{name} {version}" for name, version in known["versions"].items())
-    shown = Table(f"card-{env}", f"{env} ({made})", header, rows)
-    parts = [table(shown, caption=True, download=False)]
-    if picture.exists():
-        data = base64.b64encode(picture.read_bytes()).decode()
-        alt = f"{env}: learning curve of the behaviour agent, and the histogram of returns of each level"
-        parts.append(tag("figure", tag("img", src=f"data:image/png;base64,{data}", alt=alt)))
-    return join(*parts)
-
-
-def _facts(values: Mapping[str, Any]) -> list[tuple[str, float | None]]:
-    numbers: list[tuple[str, float | None]] = [
-        (f"{values[key]:,}", values[key]) for key in ("transitions", "episodes")
-    ]
-    numbers += [(f"{values[key]:,.1f}", values[key]) for key in ("return", "std", "score")]
-    return [
-        *numbers,
-        (f"{100 * values['terminated']:.1f}%", values["terminated"]),
-        (values["content_sha256"][:12], None),
-    ]
-
-
-def _fact(found: tuple[str, float | None]) -> Cell:
-    return Cell(*found)
+    return join(tag("p", "Begun, not evaluated yet, and so without a score:"), tag("ul", *names))

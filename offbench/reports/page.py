@@ -130,7 +130,7 @@ def _key(look: Line) -> Markup:
 
 
 def boxes(results: Results) -> list[Markup]:
-    """Return a box for every cell of Table 1: where its number comes from."""
+    """Return a box for every cell of the score table: where its number comes from."""
     found = []
     for i, task in enumerate(results.tasks):
         for j, method in enumerate(results.methods):

@@ -1,4 +1,4 @@
-"""The report's Table 2: how often a policy's action counts as the dataset's."""
+"""The report's similar score (the paper's Table 2): how often a policy's action counts as the dataset's."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 from offbench.errors import OffbenchError
 from offbench.files import read_json
 from offbench.reports.layout import Cell, Table
-from offbench.reports.tables import NONE, plus_minus, published
-from offbench.results import Entry, Method, Results, Task
+from offbench.reports.tables import NONE, plus_minus, published, row_name
+from offbench.results import Entry, Method, Results
 from offbench.scores import mean_std
 
 
 def similarity_tables(results: Results) -> list[Table]:
-    """Return Table 2 (similar score) and its details, from the runs' similarity.json; [] if there is none."""
+    """Return the similar scores and their details, from the runs' similarity.json; [] if there is none."""
     paper = {(r["env"], r["level"], r["method"]): r["similar_score_percent"] for r in published("similarity")}
     found = {key: values for key, entry in results.entries.items() if (values := _similar(entry))}
     methods = [method for method in results.methods if any(key[1] == method for key in found)]
@@ -30,20 +30,22 @@ def similarity_tables(results: Results) -> list[Table]:
             by_q, by_action = (mean_std([float(v[key]) for v in values]) for key in ("q_similar", "action_similar"))
             number = paper.get((env, level, _similar_name(method)))
             cells.append(Cell(plus_minus(by_q), by_q[0], f"paper {number}" if number else ""))
-            details.append(_similar_row(task, method, values, by_q, by_action, number))
+            details.append([*row_name(results, task), *_similar_row(method, values, by_q, by_action, number)])
         if any(cell is not NONE for cell in cells):
-            rows.append([Cell(level or "-"), Cell(env, below=task.name), *cells])
+            rows.append([*row_name(results, task), *cells])
     if not rows:
         return []
+    beside = any(cell.below for row in rows for cell in row[2:])
     notes = [
         "Percent of sampled transitions on which the policy's action counts as the dataset's, mean ± standard "
         "deviation over seeds: |Q1(s, π(s)) - Q1(s, a)| at most the tolerance times |Q1(s, a)|. The paper gives no "
-        "formula; this reading of its Table 2 is ours. “paper”: its printed number, on D4RL's v0 datasets.",
+        "formula; this reading of its Table 2 is ours."
+        + (" “paper”: its printed number, on D4RL's v0 datasets." if beside else "")
     ]
     header = ["level", "environment", *[method.label for method in methods]]
     columns = ["level", "environment", "method", "by Q (%)", "by action (%)", "paper (%)", "seeds", "step", "samples"]
     return [
-        Table("similarity", "Table 2: similar score", header, rows, notes, 2),
+        Table("similarity", "Similar score (the BDB paper's Table 2)", header, rows, notes, 2),
         Table("similarity-details", "Similar score in both readings", [*columns, "tolerances"], details, [], 3),
     ]
 
@@ -67,20 +69,16 @@ def _similar_name(method: Method) -> str:
 
 
 def _similar_row(
-    task: Task,
     method: Method,
     values: Sequence[Mapping[str, Any]],
     by_q: tuple[float, float | None],
     by_action: tuple[float, float | None],
     number: str | None,
 ) -> list[Cell]:
-    env, level = task.place
     steps, samples = (sorted({int(v[key]) for v in values}) for key in ("step", "samples"))
     tolerances = sorted({f"Q {v['tolerance']:g}, action {v['action_tolerance']:g}" for v in values})
     numbers = [Cell(", ".join(f"{n:,}" for n in ns), ns[0]) for ns in (steps, samples)]
     return [
-        Cell(level or "-"),
-        Cell(env, below=task.name),
         Cell(method.label),
         Cell(plus_minus(by_q), by_q[0]),
         Cell(plus_minus(by_action), by_action[0]),

@@ -1,4 +1,4 @@
-"""The report's tables: the paper's Tables 1 and 2 with our numbers, and the statistics over tasks."""
+"""The report's tables: scores beside the paper's numbers, and the statistics over tasks."""
 
 from __future__ import annotations
 
@@ -6,14 +6,19 @@ import csv
 import dataclasses
 import importlib.resources
 from collections.abc import Mapping, Sequence
+from typing import Any
 
+from offbench.comparison import differences, favoured, partners
 from offbench.reports.layout import Cell, Table
-from offbench.results import REFERENCES, Entry, Method, Results
+from offbench.results import REFERENCES, Entry, Method, Results, Task
+from offbench.runs import DIGITS
 from offbench.scores import LAST, mean_std
-from offbench.statistics import Estimate, Scores, improvement, iqm
+from offbench.statistics import Estimate, Scores, improvement, iqm, paired
+from offbench.wording import counted
 
 PAPER = "BDB paper, Table 1"
 NONE = Cell("-")
+FEW_SEEDS = "No interval where a task has a single seed; with few seeds it covers less than 95% (docs/statistics.md)."
 DIFFERENT_DATA = (
     "The datasets are not the same: the published numbers are of D4RL's v0 and v2 files, recorded in older "
     "environments by other agents and normalised by D4RL's constants; ours are of the datasets named here. Read them "
@@ -34,7 +39,7 @@ def plus_minus(found: tuple[float, float | None], digits: int = 1) -> str:
 
 
 def score_table(results: Results) -> Table:
-    """Return Table 1 in the paper's layout: a row a dataset, a column a method."""
+    """Return the scores in the layout of the paper's Table 1: a row a dataset, a column a method."""
     paper = {
         (row["env"], row["level"], row["method"]): float(row["normalized_score"])
         for row in published("scores")
@@ -51,24 +56,32 @@ def score_table(results: Results) -> Table:
             if entry is None:
                 cells.append(NONE)
                 continue
-            more = [] if len(seeds) == 1 else [_seeds(len(entry.runs))]
+            more = [] if len(seeds) == 1 else [counted(len(entry.runs), "seed")]
             more += [] if steps[method] else [column_steps([entry])]
             number = paper.get((env, level, method.published))
             below = "" if number is None else f"paper {number:g}"
             cells.append(_score_cell(entry, below, cell_id(i, j), ", ".join(more)))
         below_row = "" if len({t.reference for t in results.tasks}) == 1 else REFERENCES[task.reference]
-        rows.append(
-            [Cell(level or "-"), Cell(env, below=" · ".join(filter(None, [task.name, below_row]))), *_best(cells)]
-        )
+        rows.append([*row_name(results, task, below_row), *_best(cells)])
+    beside = any(cell.below for row in rows for cell in row[2:])
     return Table(
         "scores",
-        "Table 1: normalised scores",
+        "Scores (the BDB paper's Table 1)" if beside else "Scores",
         ["level", "environment", *[method.label for method in results.methods]],
         rows,
-        _score_notes(results, seeds),
+        _score_notes(results, seeds, beside),
         heads=2,
         small=["", "", *[steps[method] or "steps differ" for method in results.methods]],
     )
+
+
+def row_name(results: Results, task: Task, more: str = "") -> list[Cell]:
+    """Return level and environment as a row's name, with what tells it apart where another dataset has the same."""
+    env, level = task.place
+    namesakes = {other.dataset for other in results.tasks if other.place == task.place}
+    apart = task.name if len(namesakes) > 1 else task.content[:DIGITS] if task.twin else ""
+    below = [task.dataset if apart != task.name else "", more]
+    return [Cell(level or "-"), Cell(env, below=" · ".join(filter(None, below)), more=apart)]
 
 
 def cell_id(task: int, method: int) -> str:
@@ -100,20 +113,19 @@ def _best(cells: Sequence[Cell]) -> list[Cell]:
     return [dataclasses.replace(cell, best=best) for cell, best in zip(cells, same, strict=True)]
 
 
-def _seeds(count: int) -> str:
-    return f"{count} seed" if count == 1 else f"{count} seeds"
-
-
-def _score_notes(results: Results, seeds: set[int]) -> list[str]:
+def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
     entries = list(results.entries.values())
     behind = sorted({entry.evaluations for entry in entries})
     last = f"{behind[0]}" if len(behind) == 1 else f"{behind[0]} to {behind[-1]}"
-    over = _seeds(seeds.copy().pop()) if len(seeds) == 1 else "the seeds that each cell names"
+    over = counted(min(seeds), "seed") if len(seeds) == 1 else "the seeds that each cell names"
+    single = " “± ?”: a single seed has no standard deviation." if 1 in seeds else ""
     notes = [
-        f"Mean ± standard deviation over {over} (? where one seed has none). A seed's score is the mean of its last "
-        f"{LAST} evaluations, never its best ({last} of them here). {scale(results)} Best mean of a row in bold.",
-        f"“paper”: {PAPER} (5 seeds, 1M steps). {DIFFERENT_DATA}",
+        f"Mean ± standard deviation over {over}.{single} A seed's score is the mean of its last {LAST} evaluations, "
+        f"never its best ({last} of them here). {scale(results)} The best mean of a row is in bold; whether a "
+        "difference is real, `offbench compare` says.",
     ]
+    if beside:
+        notes.append(f"“paper”: {PAPER} (5 seeds, 1M steps). {DIFFERENT_DATA}")
     states = set().union(*(entry.states for entry in entries))
     if "diverged" in states:
         notes.insert(1, "‡ a run became NaN or infinite and stopped: the number is of its evaluations before that.")
@@ -121,7 +133,8 @@ def _score_notes(results: Results, seeds: set[int]) -> list[str]:
         notes.insert(1, "† training is not finished: the number is of the steps done so far and may still change.")
     if any(task.twin for task in results.tasks):
         notes.append(
-            "A dataset named twice was recorded twice with different content; its first digits tell them apart."
+            "A dataset named twice was recorded again with different content: the first digits of the content's hash, "
+            "in brackets, tell them apart."
         )
     return notes
 
@@ -157,8 +170,7 @@ def beside_table(results: Results) -> Table | None:
         ours = [entry.mean_std(reference) for reference in ("dataset", "d4rl")]
         cells = [Cell(plus_minus(pair), pair[0]) if pair else NONE for pair in ours]
         cells += [Cell(text, float(text.split()[0])) if (text := found.get(source)) else NONE for source in sources]
-        env, level = entry.task.place
-        rows.append([Cell(level), Cell(env), Cell(entry.method.label), *cells])
+        rows.append([*row_name(results, entry.task), Cell(entry.method.label), *cells])
     header = ["level", "environment", "method", "ours", "ours", *[source for source, _ in sources]]
     small = ["", "", "", "own reference", "D4RL's constants", *[protocol for _, protocol in sources]]
     notes = [DIFFERENT_DATA, "Deviations of published numbers are as printed there."]
@@ -182,18 +194,17 @@ def iqm_table(results: Results, found: Mapping[Method, tuple[Estimate, Scores]])
     notes = [
         "Interquartile mean of the normalised scores of all runs of all tasks (the mean without the lowest and "
         "highest quarter), and its 95% interval by stratified bootstrap: seeds are resampled within each "
-        "task (Agarwal et al. 2021). No interval where a task has a single seed; "
-        "with few seeds it covers less than 95% (docs/statistics.md).",
+        f"task (Agarwal et al. 2021). {FEW_SEEDS}",
     ]
     if len({tuple(scores) for _, scores in found.values()}) > 1:
         notes.append("The methods were not run on the same tasks: their IQMs do not compare one with another.")
     if len({entry.reached for entry in results.entries.values()}) > 1:
-        notes.append("Not all runs have trained for the same number of steps: Table 1 says how many.")
+        notes.append("Not all runs have trained for the same number of steps: the table of scores says how many.")
     header = ["method", "IQM", "95% low", "95% high", "tasks", "runs"]
     return Table("iqm", "Interquartile mean over tasks", header, rows, notes)
 
 
-def improvement_table(found: Mapping[Method, tuple[Estimate, Scores]]) -> Table:
+def improvement_table(results: Results, found: Mapping[Method, tuple[Estimate, Scores]]) -> Table:
     """Return the probability that a run of the row's method beats one of the column's, over their common tasks."""
     methods = list(found)
     known: dict[tuple[Method, Method], Estimate] = {}
@@ -203,24 +214,34 @@ def improvement_table(found: Mapping[Method, tuple[Estimate, Scores]]) -> Table:
                 known[a, b] = estimate = improvement(found[a][1], found[b][1])
                 ends = (None if end is None else 1 - end for end in (estimate.high, estimate.low))
                 known[b, a] = Estimate(1 - estimate.value, *ends)
-    rows = [[Cell(a.label), *[_chance(known.get((a, b))) for b in methods]] for a in methods]
+    better = {pair for pair in known if _better(results, *pair)}
+    rows = [[Cell(a.label), *[_chance(known.get((a, b)), (a, b) in better) for b in methods]] for a in methods]
     notes = [
         "Probability in percent that a run of the row's method scores above one of the column's, averaged over the "
-        "tasks that both have, with its 95% interval by stratified bootstrap. 50 is a draw; bold: the interval lies "
-        "above 50.",
+        f"tasks that both have, with its 95% interval by stratified bootstrap. 50 is a draw. {FEW_SEEDS} An interval "
+        "above 50 is therefore no evidence by itself. Bold: `offbench compare` finds the row's method better, as the "
+        "interval of the paired difference and the sign-flip test agree. Each pair is tested by itself: of many "
+        "pairs of equal methods a few come out bold by chance.",
     ]
     title = "Probability of improvement"
     return Table("improvement", title, ["row above column", *[method.label for method in methods]], rows, notes)
 
 
-def _chance(estimate: Estimate | None) -> Cell:
+def _better(results: Results, a: Method, b: Method) -> bool:
+    """Return whether `compare` finds A better, on the tasks that have scores."""
+    groups = ([entry for entry in results.of(method) if entry.task.reference] for method in (a, b))
+    both = partners(*groups)
+    return bool(both) and favoured(paired(differences(both))) > 0
+
+
+def _chance(estimate: Estimate | None, better: bool) -> Cell:
     if estimate is None:
         return NONE
     in_percent = estimate.percent()
     text = f"{in_percent.value:.0f}"
     if in_percent.low is not None:
         text += f" [{in_percent.low:.0f}, {in_percent.high:.0f}]"
-    return Cell(text, in_percent.value, best=in_percent.low is not None and in_percent.low > 50)
+    return Cell(text, in_percent.value, best=better)
 
 
 def seed_table(results: Results) -> Table:
@@ -245,7 +266,7 @@ def seed_table(results: Results) -> Table:
             )
     for run in results.waiting:
         config = run.config()
-        words = [str(config["dataset"]), f"{config['algorithm']} {config['variant']}".removesuffix(" default")]
+        words = [_waiting_name(results, config), f"{config['algorithm']} {config['variant']}".removesuffix(" default")]
         numbers = [
             Cell(str(config["seed"])),
             NONE,
@@ -258,6 +279,13 @@ def seed_table(results: Results) -> Table:
         rows.append([*map(Cell, words), *numbers, Cell("diverged" if run.diverged else "not evaluated yet")])
     header = ["dataset", "method", "seed", "score", "return", "reference", "evaluations", "step", "of", "state"]
     return Table("seeds", "Every run", header, rows, [], 3)
+
+
+def _waiting_name(results: Results, config: Mapping[str, Any]) -> str:
+    """Return a dataset's id, with its content's first digits where the id alone is ambiguous."""
+    contents = {task.content for task in results.tasks if task.dataset == config["dataset"]}
+    twin = bool(contents) and contents != {config["dataset_sha256"]}
+    return Task(config["dataset"], config["dataset_sha256"], None, twin).name
 
 
 def _in_order(results: Results) -> list[Entry]:

@@ -1,0 +1,97 @@
+"""The report's datasets: what the runs were trained on, and the shipped cards of the same environments beside it."""
+
+from __future__ import annotations
+
+import base64
+import importlib.resources
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from offbench import dataset, transitions
+from offbench.errors import OffbenchError
+from offbench.files import read_json
+from offbench.reports.layout import Cell, Table
+from offbench.reports.markup import Markup, join, tag
+from offbench.reports.page import table
+from offbench.reports.tables import NONE
+from offbench.results import Results, Task
+
+SHOWN = 12  # digits of a content hash, in the cards as here
+
+
+def dataset_table(results: Results) -> Table:
+    """Return the datasets that the runs were trained on, as their config.json names them."""
+    rows = []
+    for task in results.tasks:
+        runs = [trained for (found, _), entry in results.entries.items() if found == task for trained in entry.runs]
+        envs = sorted({str(trained.config.get("env_id") or "") for trained in runs} - {""})
+        rows.append(
+            [Cell(task.dataset), Cell(", ".join(envs) or "-"), *_sizes(task), Cell(task.content[:SHOWN])],
+        )
+    header = ["dataset", "environment", "transitions", "episodes", "mean return", "content"]
+    notes = [
+        "“content”: the first digits of the SHA-256 over a dataset's arrays, as each run's config.json has it. Sizes "
+        "and mean return were read where this report was written; “-”: no dataset of this content was there."
+    ]
+    return Table("datasets", "Datasets that the runs were trained on", header, rows, notes, 2)
+
+
+def _sizes(task: Task) -> list[Cell]:
+    """Return transitions, episodes and mean return of a dataset if it is here with the same content."""
+    try:
+        recorded = dataset.provenance(dataset.read_metadata(task.dataset)).get("content_sha256")
+        if recorded not in (None, task.content):
+            return [NONE] * 3  # recorded again since: not worth a conversion
+        data = transitions.load(task.dataset)
+    except (OffbenchError, OSError):  # OSError: a name that no file system takes
+        return [NONE] * 3
+    if data.content != task.content:
+        return [NONE] * 3
+    mean = float(data.returns.mean())
+    counts = [Cell(f"{count:,}", count) for count in (len(data), len(data.ends))]
+    return [*counts, Cell(f"{mean:,.1f}", mean)]
+
+
+def cards(results: Results) -> list[Markup]:
+    """Return the shipped cards of the environments that occur."""
+    found = (_card(env) for env in dict.fromkeys(task.place[0] for task in results.tasks))
+    return [card for card in found if card]
+
+
+def _card(env: str) -> Markup | None:
+    """Return an environment's shipped dataset card, None where there is none."""
+    if not re.fullmatch(r"[a-z0-9_-]+", env):
+        return None
+    folder = importlib.resources.files("offbench") / "datasets" / env
+    card, picture = Path(str(folder / "card.json")), Path(str(folder / "card.png"))
+    if not card.exists():
+        return None
+    known = read_json(card)
+    rows = [[Cell(level), *map(_fact, _facts(values))] for level, values in known["levels"].items()]
+    header = ["level", "transitions", "episodes", "mean return", "std", "score", "terminated", "content"]
+    made = ", ".join(f"{name} {version}" for name, version in known["versions"].items())
+    shown = Table(f"card-{env}", f"{env} ({made})", header, rows)
+    parts = [table(shown, caption=True, download=False)]
+    if picture.exists():
+        data = base64.b64encode(picture.read_bytes()).decode()
+        alt = f"{env}: learning curve of the behaviour agent, and the histogram of returns of each level"
+        parts.append(tag("figure", tag("img", src=f"data:image/png;base64,{data}", alt=alt)))
+    return join(*parts)
+
+
+def _facts(values: Mapping[str, Any]) -> list[tuple[str, float | None]]:
+    numbers: list[tuple[str, float | None]] = [
+        (f"{values[key]:,}", values[key]) for key in ("transitions", "episodes")
+    ]
+    numbers += [(f"{values[key]:,.1f}", values[key]) for key in ("return", "std", "score")]
+    return [
+        *numbers,
+        (f"{100 * values['terminated']:.1f}%", values["terminated"]),
+        (values["content_sha256"][:SHOWN], None),
+    ]
+
+
+def _fact(found: tuple[str, float | None]) -> Cell:
+    return Cell(*found)
