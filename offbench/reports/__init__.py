@@ -4,7 +4,7 @@
     tables/      the same tables: CSV, Markdown, LaTeX
     figures/     the same figures: PNG, SVG
 
-The same runs give the same bytes.
+The same runs and local datasets give the same bytes.
 """
 
 from __future__ import annotations
