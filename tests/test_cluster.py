@@ -14,6 +14,7 @@ import pytest
 from offbench import cluster
 from offbench.benchmarking import benchmark
 from offbench.errors import OffbenchError
+from offbench.grid import load_grid
 from offbench.planning import prepare
 from offbench.runs import Run, find_runs
 
@@ -109,7 +110,7 @@ def test_nodes_that_share_no_disk_fetch_and_bring_back(
 def test_what_fails_on_a_node_is_said_here(two_nodes: Any, home: Path) -> None:
     nodes, _ = two_nodes
     (home / "grid.toml").write_text(GRID.replace('env = "inverted-pendulum"', 'env = "./gone.toml"'))
-    source = benchmark.load_grid("./grid.toml").datasets
+    source = load_grid("./grid.toml").datasets
     with pytest.raises(OffbenchError, match="no recipe file"):
         cluster.RayExecutor(nodes.address).record(source, 1)
 
