@@ -12,9 +12,9 @@ echo "== recording a small hopper dataset"
 
 echo "== training three algorithms on it"
 train="--dataset hopper-medium-v0 --runs demo/runs --eval-episodes 5"
-"$BIN/offbench" train td3_bc $train --steps 10000 --eval-every 2000
-"$BIN/offbench" train bdb $train --steps 10000 --eval-every 2000 --beta 0.25
-"$BIN/offbench" train cql $train --steps 500 --eval-every 100 --bc-steps 200 --actor-learning-rate 3e-4
+"$BIN/offbench" train td3_bc $train --steps 6000 --eval-every 2000
+"$BIN/offbench" train bdb $train --steps 6000 --eval-every 2000 --beta 0.25
+"$BIN/offbench" train cql $train --steps 300 --eval-every 100 --bc-steps 100 --actor-learning-rate 3e-4
 
 echo "== scores"
 "$BIN/offbench" normalize --runs demo/runs --plot demo/curves.png

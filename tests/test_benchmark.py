@@ -254,7 +254,7 @@ def test_smoke_survives_five_kill_9(home: Path, monkeypatch: pytest.MonkeyPatch)
         while not done:
             process = subprocess.Popen(command("killed"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             try:
-                done = process.wait(rng.uniform(0.3, 1.0) * took if kills < 5 else None) == 0
+                done = process.wait(rng.uniform(0.15, 0.7) * took if kills < 5 else None) == 0
                 assert done
             except subprocess.TimeoutExpired:
                 process.send_signal(signal.SIGKILL)
