@@ -18,6 +18,7 @@ import offbench
 from offbench import dataset, registry
 from offbench.algorithm import PolicyParts
 from offbench.cli import main
+from offbench.plots import plot_curves
 from offbench.registry import load_algorithm
 from tests.conftest import TINY_RECIPE
 from tests.test_transitions import episode, foreign
@@ -107,7 +108,7 @@ CASES: dict[str, tuple[str, str]] = {
         "unknown dataset 'x-v0'",
         "'nan-v0'? Or record one: `offbench collect ENV --level LEVEL`",
     ),
-    "show something-v0": ("known: discrete-v0, nan-v0, tiny-medium-v0; record one: `offbench collect ENV", ""),
+    "show xyzzy-v0": ("known: discrete-v0, nan-v0, tiny-medium-v0; record one: `offbench collect ENV", ""),
     "show hopper-medium-expert-v0": (
         "hopper-medium-expert-v0 is not recorded yet: `offbench collect hopper --level medium-expert`",
         "",
@@ -143,6 +144,9 @@ CASES: dict[str, tuple[str, str]] = {
     "export MEDIUM --out out.hdf5 --drop-timeouts": ("--drop-timeouts goes with --format npz", ""),
     "export MEDIUM --out .": ("cannot write", ""),
     "export MEDIUM --out empty.safetensors/out.hdf5": ("cannot write", ""),
+    "export MEDIUM --out new/out.hdf5": ("cannot write new/out.hdf5: there is no folder new", ""),
+    "export-policy policy.safetensors --out new/policy.pt": ("there is no folder new", ""),
+    "show MEDIUM --plot new/a.png": ("cannot write new/a.png: there is no folder new", ""),
     "export DISCRETE --out out.hdf5": ("must be a Box space", ""),
     "export-policy nowhere --out policy.pt": ("no policy file nowhere", ""),
     "export-policy . --out policy.pt": ("no policy file policy.safetensors", ""),
@@ -350,6 +354,12 @@ def test_an_environment_named_by_a_file_is_not_simply_run(
     with pytest.raises(offbench.OffbenchError, match=message):
         offbench.train("td3_bc", medium, steps=10, hidden=(8,))
     assert not (home / "PWNED").exists()
+
+
+def test_curves_go_into_a_folder_that_is_there(home: Path) -> None:
+    with pytest.raises(offbench.OffbenchError, match=r"cannot write new/a\.png: there is no folder new"):
+        plot_curves("runs", "new/a.png")
+    assert not (home / "new").exists()
 
 
 def test_a_ladder_never_replaces_other_files(tiny: tuple[str, str], home: Path) -> None:
