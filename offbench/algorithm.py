@@ -103,6 +103,19 @@ class Algorithm(Protocol):
         ...
 
 
+def check_logs(logs: Any, runs: int, where: str) -> None:
+    """Raise OffbenchError if an update returned something else than logs, each a tensor [runs]; reads shapes alone."""
+    if not isinstance(logs, Mapping):
+        raise OffbenchError(f"{where} must return a dict of logs, not a {type(logs).__name__}")
+    for name, value in logs.items():
+        tensor = isinstance(value, Tensor)
+        if not tensor or value.shape != (runs,):
+            found = f"one {list(value.shape)}" if tensor else f"a {type(value).__name__}"
+            raise OffbenchError(f"{where}: log {name!r} must be a tensor [runs] = [{runs}], got {found}")
+        if value.requires_grad:  # the sums of logs would keep the graph of every update
+            raise OffbenchError(f"{where}: log {name!r} must be detached: {name}.detach()")
+
+
 def stack_configs(configs: Sequence[Any], device: torch.device | str) -> Any:
     """Return one config for a stack: `per_run` settings as tensors [runs], the others as they are.
 

@@ -19,7 +19,9 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench.errors import OffbenchError, unknown
 from offbench.files import disk_errors, read_json, sole
+from offbench.levels import parse_level
 from offbench.policy import Array
+from offbench.recipes import load_recipe, names
 from offbench.rollout import Episode
 from offbench.safefile import SafeFile, safe_file
 
@@ -64,6 +66,42 @@ def local_ids() -> list[str]:
     return sorted(str(path) for path in found if not any(part.startswith(".") for part in path.parts))
 
 
+def recorded_by(dataset_id: str) -> tuple[str, str]:
+    """Return the shipped recipe and the `--level` that an id such as `hopper-60percent-v0` names, else ("", "")."""
+    body = dataset_id.rpartition("-v")[0]
+    for env in sorted(names(), key=len, reverse=True):
+        level = body.removeprefix(f"{env}-")
+        if level != body:
+            return env, _level(level)
+    return "", ""
+
+
+def _level(name: str) -> str:
+    """Return what `--level` takes for a level's name in an id: 60percent is 0.6."""
+    if name.endswith("percent"):
+        try:
+            return f"{float(name.removesuffix('percent').replace('p', '.')) / 100:g}"
+        except ValueError:
+            return name
+    return name
+
+
+def _absent(dataset_id: str) -> OffbenchError:
+    """Return the error for a dataset that is not here: how to record this very one, else the nearest that is here."""
+    env, level = recorded_by(dataset_id)
+    with contextlib.suppress(OffbenchError):  # no level
+        name = f"{env}-{parse_level(level)[0]}-v{load_recipe(env).version}"
+        command = f"`offbench collect {env} --level {level}`"
+        if name == dataset_id:
+            return OffbenchError(f"{dataset_id} is not recorded yet: {command}")
+        if not exists(name):
+            return OffbenchError(f"unknown dataset {dataset_id!r}: {command} records {name}")
+    said = str(unknown("dataset", dataset_id, local_ids()))
+    return OffbenchError(
+        f"{said}{' Or' if said.endswith('?') else ';'} record one: `offbench collect ENV --level LEVEL`"
+    )
+
+
 def read_metadata(dataset_id: str) -> dict[str, Any]:
     """Return a local dataset's metadata as Minari wrote it.
 
@@ -72,8 +110,7 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
     """
     path = root() / dataset_id / "data" / "metadata.json"
     if not exists(dataset_id):
-        hint = "record one with `offbench collect ENV --level LEVEL`"
-        raise OffbenchError(f"{unknown('dataset', dataset_id, local_ids())}; {hint}")
+        raise _absent(dataset_id)
     metadata = read_json(path)
     try:
         _check_metadata(metadata)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from offbench.errors import OffbenchError
-from offbench.files import write_bytes
+from offbench.files import output_file, write_bytes
 from offbench.policy import Array, Policy, load_policy
 from offbench.runs import Run
 
@@ -60,9 +60,9 @@ def export_policy(path: str | Path, out: str | Path) -> Path:
     The file also says where the policy comes from (`_extra_files`, "offbench.json").
 
     Raises:
-        OffbenchError: no policy there, one that has no single best action, or the disk refuses.
+        OffbenchError: no policy there, one that has no single best action, no such folder, or the disk refuses.
     """
-    place, target = Path(path), Path(out)
+    place, target = Path(path), output_file(out)
     policy = load_policy(Run(place).policy_path if place.is_dir() else place)
     if policy.kind not in ("tanh", "squashed_gaussian"):
         reason = "chooses among random actions" if policy.kind == "best_by_q" else "is random"

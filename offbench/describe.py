@@ -105,8 +105,9 @@ class Summary:
 
     def plot(self, path: str | Path) -> Path:
         """Draw the histogram of returns. Raises OffbenchError if the picture cannot be written."""
-        from offbench.plots import figure, save
+        from offbench.plots import figure, picture_file, save
 
+        path = picture_file(path)
         with figure() as (fig, (axes,)):
             axes.hist(self.returns, bins=40, color="#3b6ea5")
             axes.axvline(self.returns.mean(), color="#c44", linewidth=1.2, label=f"mean {self.returns.mean():.0f}")

@@ -29,7 +29,10 @@ def env_spec(env_id: str, **kwargs: Any) -> str:
         assert env.spec is not None
         text = env.spec.to_json()
     except Exception as error:  # a third-party environment may raise anything here
-        raise OffbenchError(f"cannot make the environment {env_id!r}: {_reason(error)}") from error
+        hint = ""
+        if isinstance(error, gym.error.NameNotFound | gym.error.NamespaceNotFound) and ":" not in env_id:
+            hint = f" If a module of yours registers it, name it before a colon: my_module:{env_id}"
+        raise OffbenchError(f"cannot make the environment {env_id!r}: {_reason(error)}{hint}") from error
     _check_spaces(env, env_id)
     return text
 

@@ -24,7 +24,7 @@ from minari.serialization import serialize_space
 from offbench import dataset
 from offbench.environments import box
 from offbench.errors import OffbenchError
-from offbench.files import disk_errors
+from offbench.files import disk_errors, output_file
 from offbench.policy import Array
 from offbench.progress import Progress
 from offbench.safefile import SafeFile, safe_file
@@ -57,29 +57,27 @@ def export(dataset_id: str, out: str | Path, *, style: str = "d4rl", drop_timeou
         The file.
 
     Raises:
-        OffbenchError: no such dataset, other spaces, damaged data, or the disk refuses.
+        OffbenchError: no such dataset, other spaces, damaged data, no such folder, or the disk refuses.
     """
     if style not in FORMATS:
         raise OffbenchError(f"a format is one of {', '.join(FORMATS)}, not {style!r}")
     if drop_timeouts and style == "d4rl":
         raise OffbenchError("--drop-timeouts goes with --format npz: whoever reads a D4RL file drops them himself")
-    path, metadata, data = Path(out), dataset.read_metadata(dataset_id), open_minari(dataset_id)
+    path, metadata, data = output_file(out), dataset.read_metadata(dataset_id), open_minari(dataset_id)
     for name in ("observation_space", "action_space"):
         box(getattr(data, name), f"{dataset_id}: {name}")
-    with disk_errors(str(path)):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            aside = Path(folder) / path.name
-            with Progress(int(data.total_steps), f"exporting {dataset_id}") as progress:
-                columns = _columns(data, dataset_id, progress)
-                if style == "d4rl":
-                    _write_d4rl(aside, columns, _about(data, metadata))
-                else:
-                    dropped = dataset.provenance(metadata).get("timeouts") == "dropped"
-                    _write_npz(aside, (_float32(part) for part in columns), drop_timeouts, dropped)
-            with open(aside, "rb") as file:
-                os.fsync(file.fileno())
-            os.replace(aside, path)
+    with disk_errors(str(path)), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        aside = Path(folder) / path.name
+        with Progress(int(data.total_steps), f"exporting {dataset_id}") as progress:
+            columns = _columns(data, dataset_id, progress)
+            if style == "d4rl":
+                _write_d4rl(aside, columns, _about(data, metadata))
+            else:
+                dropped = dataset.provenance(metadata).get("timeouts") == "dropped"
+                _write_npz(aside, (_float32(part) for part in columns), drop_timeouts, dropped)
+        with open(aside, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(aside, path)
     return path
 
 

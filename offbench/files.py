@@ -83,6 +83,14 @@ def write_bytes(path: Path, data: bytes) -> None:
             raise
 
 
+def output_file(path: str | Path) -> Path:
+    """Return the path of a file that a user asks for. Raises OffbenchError if its folder is not there."""
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise OffbenchError(f"cannot write {path}: there is no folder {path.parent}")
+    return path
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write `value` as indented JSON, whole or not at all."""
     write_bytes(path, (json.dumps(value, indent=1, sort_keys=False, allow_nan=False) + "\n").encode())

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import os
+import warnings
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +23,7 @@ from gymnasium.envs.registration import EnvSpec
 from offbench import seeds
 from offbench.assess import open_policy
 from offbench.errors import OffbenchError
-from offbench.files import disk_errors, write_bytes
+from offbench.files import disk_errors, output_file, write_bytes
 from offbench.ladder import read_ladder
 from offbench.levels import SINGLE, parse_level
 from offbench.policy import Policy, uniform
@@ -33,7 +34,7 @@ from offbench.seeds import Purpose
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-ENDINGS = (".mp4", ".gif")
+ENDINGS = (".gif", ".mp4")
 COLOURS = 64  # of a GIF
 STREAM = (int(Purpose.REFERENCE), 3)  # episodes of their own, seen in no measurement
 
@@ -41,7 +42,7 @@ STREAM = (int(Purpose.REFERENCE), 3)  # episodes of their own, seen in no measur
 def video(
     path: str | Path,
     *,
-    out: str | Path = "video.mp4",
+    out: str | Path = "video.gif",
     env: str | None = None,
     episodes: int = 1,
     seconds: float | None = None,
@@ -54,7 +55,7 @@ def video(
     Args:
         path: a run directory or a policy file, which act deterministically; or ENV:LEVEL such as `hopper:medium`,
             whose actions are sampled as they are in its dataset.
-        out: the film's file, .mp4 or .gif.
+        out: the film's file, .gif or .mp4.
         env: a recipe, instead of the environment that the run or policy names.
         episodes: how many, one after the other.
         seconds: length of the film at most (default: whole episodes).
@@ -66,9 +67,9 @@ def video(
         The file.
 
     Raises:
-        OffbenchError: no such policy, an environment that cannot be drawn, no renderer, no mp4 encoder.
+        OffbenchError: no such policy or folder, an environment that cannot be drawn, no renderer, no mp4 encoder.
     """
-    target = Path(out)
+    target = output_file(out)
     if target.suffix.lower() not in ENDINGS:
         raise OffbenchError(f"a video's file ends in {' or '.join(ENDINGS)}, not {target.name!r}")
     if min(episodes, fps, size) < 1 or (seconds is not None and seconds <= 0):
@@ -113,9 +114,11 @@ def _drawable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
     made = EnvSpec.from_json(spec)
     made.disable_env_checker = True
     try:
-        env = gym.make(made, render_mode="rgb_array")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it does not list this mode: its first picture tells
+            env = gym.make(made, render_mode="rgb_array")
     except Exception as error:  # a third party's environment may raise anything here
-        raise OffbenchError(f"{made.id} cannot draw pictures (render_mode rgb_array): {error}") from error
+        raise OffbenchError(f"{made.id} cannot be filmed (render_mode rgb_array): {error}") from error
     world = env.unwrapped
     if isinstance(world, MujocoEnv):
         if backend is None:
@@ -173,7 +176,11 @@ def _frame(env: gym.Env[Any, Any], step: int, total: float, size: int) -> Image:
     """Draw the environment as it stands, with step and return on it."""
     from PIL import Image, ImageDraw, ImageFont
 
-    pixels = env.render()
+    try:
+        pixels = env.render()
+    except NotImplementedError:
+        name = env.spec.id if env.spec else "the environment"
+        raise OffbenchError(f"{name} cannot be filmed: it has no rgb_array rendering") from None
     if not isinstance(pixels, np.ndarray) or pixels.ndim != 3:
         raise OffbenchError(f"the environment draws {type(pixels).__name__}, not a picture of [height, width, 3]")
     image = Image.fromarray(pixels[..., :3].astype(np.uint8))
@@ -207,7 +214,6 @@ def _encoder() -> Any:
     def mp4(path: Path, frames: Iterator[Image], fps: float) -> None:
         aside = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
         with disk_errors(str(path)):
-            path.parent.mkdir(parents=True, exist_ok=True)
             try:
                 first = next(frames)
                 writer = imageio_ffmpeg.write_frames(str(aside), first.size, fps=fps, macro_block_size=2, quality=7)

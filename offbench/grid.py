@@ -22,7 +22,6 @@ from typing import Any
 from offbench import dataset
 from offbench.errors import OffbenchError, unknown
 from offbench.levels import parse_level
-from offbench.recipes import names
 from offbench.settings import build, setting
 
 
@@ -31,7 +30,8 @@ class Source:
     """A dataset of a grid, and how it is recorded if it is missing.
 
     Attributes:
-        env: a recipe's name or file; empty for a dataset that offbench cannot record.
+        env: a recipe's name or file (from the grid's folder if there is one, else from the current one); empty for a
+            dataset that offbench cannot record.
     """
 
     id: str
@@ -101,7 +101,7 @@ def load_grid(name: str) -> Grid:
     times = _times(values, Times(), where)
     return Grid(
         path.stem,
-        tuple(_source(value, where) for value in sources),
+        tuple(_source(value, path.parent, where) for value in sources),
         tuple(_entry(value, times, where) for value in entries),
     )
 
@@ -124,31 +124,18 @@ def _times(values: dict[str, Any], default: Times, where: str) -> Times:
     return build(Times, whole | {"seeds": tuple(seeds)}, where)
 
 
-def _source(value: Any, where: str) -> Source:
-    """Return a dataset from its id alone (a shipped recipe's level) or from a table."""
+def _source(value: Any, folder: Path, where: str) -> Source:
+    """Return a dataset from its id alone (a shipped recipe's level) or from a table; `folder` is the grid's."""
     if isinstance(value, dict):
         source = build(Source, value, f"{where}: datasets")
         parse_level(source.level or "medium")
         dataset.check_id(source.id)
-        return source if source.level or not source.env else dataclasses.replace(source, level="medium")
+        beside = folder / source.env
+        env = str(beside) if source.env.endswith(".toml") and beside.is_file() else source.env
+        return dataclasses.replace(source, env=env, level=source.level or ("medium" if env else ""))
     if not isinstance(value, str):
         raise OffbenchError(f"{where}: datasets must be ids or tables, not {value!r}")
-    body = dataset.check_id(value).rpartition("-v")[0]
-    for env in sorted(names(), key=len, reverse=True):
-        level = body.removeprefix(f"{env}-")
-        if level != body:
-            return Source(value, env, _level(level))
-    return Source(value)
-
-
-def _level(name: str) -> str:
-    """Return what `--level` takes for a level's name in an id: 60percent is 0.6."""
-    if name.endswith("percent"):
-        try:
-            return f"{float(name.removesuffix('percent').replace('p', '.')) / 100:g}"
-        except ValueError:
-            return name
-    return name
+    return Source(dataset.check_id(value), *dataset.recorded_by(value))
 
 
 def _entry(value: Any, times: Times, where: str) -> Entry:

@@ -137,6 +137,12 @@ class Board(contextlib.AbstractContextManager["Board"]):
     def __exit__(self, *error: Any) -> None:
         self.progress.__exit__(*error)
 
+    def heard(self, job: int, step: int, note: str) -> None:
+        """Take in one of a job's reports, none of which is missed: the first says where it goes on."""
+        if job not in self.steps and step:
+            self.progress.say(f"{self.jobs[job].title}: going on from step {step:,}")
+        self.at(job, step, note)
+
     def at(self, job: int, step: int, note: str) -> None:
         """Take in that a job is at `step`."""
         if job not in self.steps:  # what was there before counts as done, not as speed
@@ -149,7 +155,7 @@ def _here(job: Job, place: int, board: Board) -> list[str]:
     if is_over(job):
         return []
     try:
-        return perform(job, lambda step, note: board.at(place, step, note))
+        return perform(job, lambda step, note: board.heard(place, step, note))
     except OffbenchError as error:
         if len(board.jobs) == 1:
             raise
@@ -204,7 +210,7 @@ def _spread(jobs: Sequence[Job], processes: int, pool: _Pool, board: Board) -> I
                 step, note = None, ""
                 lines = [f"a training process died (killed, or out of memory): {jobs[at_work].title}"]
             if step is not None:
-                board.at(at_work, step, note)
+                board.heard(at_work, step, note)
                 continue
             yield from lines
             pool.end(ready)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import operator
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,13 @@ from offbench import checkpoints, transitions
 from offbench.batches import Member
 from offbench.devices import pick_device
 from offbench.errors import OffbenchError, unknown
-from offbench.jobs import Order, complain, run_jobs
+from offbench.jobs import Job, Order, complain, run_jobs
 from offbench.loggers import Destinations
 from offbench.registry import load_algorithm
 from offbench.runs import Run, run_folder, settings_dict, variant
 from offbench.settings import build, check, fields
 from offbench.stack import Stack
-from offbench.stacking import cut, diverged, pending, with_evaluators
+from offbench.stacking import Part, cut, diverged, pending, with_evaluators
 from offbench.training import Schedule
 from offbench.workers import cores, default_workers
 
@@ -91,12 +92,21 @@ def train(
     schedule = Schedule(steps, eval_every, eval_episodes, place, workers=0, show=show)
     parts = cut(orders, place, processes, stack)
     jobs = [job for part in parts for job in pending(part, schedule, tf32=tf32, command=command)]
+    _say_finished(parts, jobs)
     if place != "cpu":
         jobs = with_evaluators(jobs, default_workers(workers))
     elif len(jobs) == 1:
         jobs = with_evaluators(jobs, max(1, cores() - 1) if workers is None else workers)
     complain(diverged(parts) + (run_jobs(jobs, processes) if jobs else []))
     return [Path(order.folder) for order in orders]
+
+
+def _say_finished(parts: Sequence[Part], jobs: Sequence[Job]) -> None:
+    """Print how many runs need nothing more: without it, a command that does nothing says nothing."""
+    runs = [member.run for part in parts for member in part.members]
+    finished = len(runs) - sum(run.diverged for run in runs) - sum(len(job.orders) for job in jobs)
+    if finished:
+        print(f"already finished: {finished} of {len(runs)} run{'s' if len(runs) > 1 else ''}", file=sys.stderr)
 
 
 def _seed_list(seeds: int | Sequence[int]) -> list[int]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from offbench.errors import OffbenchError
-from offbench.files import write_bytes
+from offbench.files import output_file, write_bytes
 from offbench.runs import DIGITS, Run
 from offbench.scores import normalize
 from offbench.tables import ambiguous, evaluated_groups
@@ -33,14 +33,18 @@ def figure(panels: int = 1) -> Iterator[tuple[Any, list[Any]]]:
     yield fig, axes
 
 
-def save(fig: Any, path: str | Path) -> Path:
-    """Write a figure in the format of its name's ending. Raises OffbenchError for an unknown ending."""
+def picture_file(path: str | Path) -> Path:
+    """Return the path of a picture that a user asks for. Raises OffbenchError for an unknown ending, or no folder."""
     path = Path(path)
-    style = path.suffix.lstrip(".").lower()
-    if style not in FORMATS:
+    if path.suffix.lstrip(".").lower() not in FORMATS:
         raise OffbenchError(f"a picture's name must end in {', '.join('.' + f for f in FORMATS)}, not {path.name!r}")
+    return output_file(path)
+
+
+def save(fig: Any, path: Path) -> Path:
+    """Write a figure in the format of its name's ending."""
     data = io.BytesIO()
-    fig.savefig(data, format=style, dpi=150)
+    fig.savefig(data, format=path.suffix.lstrip(".").lower(), dpi=150)
     write_bytes(path, data.getvalue())
     return path
 
@@ -51,6 +55,7 @@ def plot_curves(runs: str | Path, path: str | Path) -> Path:
     Raises:
         OffbenchError: there are no evaluated runs, or the picture cannot be written.
     """
+    path = picture_file(path)
     groups = evaluated_groups(runs)
     twins = ambiguous(groups)
     titles = {key: f"{key[0]} ({key[3][:DIGITS]})" if key[0] in twins else key[0] for key in groups}

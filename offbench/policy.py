@@ -18,10 +18,10 @@ import functools
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,9 @@ from safetensors.numpy import load, save
 
 from offbench.errors import OffbenchError
 from offbench.files import write_bytes
+
+if TYPE_CHECKING:
+    from offbench.algorithm import PolicyParts  # brings PyTorch, which processes that play do without
 
 Array = npt.NDArray[Any]
 KINDS = ("tanh", "squashed_gaussian", "best_by_q", "uniform")
@@ -188,30 +191,22 @@ def from_bytes(data: bytes) -> Policy:
     recorded = header.pop("sha256", None)  # older files have none
     if recorded is not None and recorded != content_sha256(tensors, header):
         raise ValueError("its content is not what was written (SHA-256)")
-    kind = header.get("kind")
-    if header.get("format") != "offbench-policy-1" or kind not in KINDS:
-        raise ValueError(f"unknown format {header.get('format')!r} or kind {kind!r}")
+    if header.get("format") != "offbench-policy-1":
+        raise ValueError(f"unknown format {header.get('format')!r}")
     sizes = {net: sum(n.startswith(f"{net}.") and n.endswith(".weight") for n in tensors) for net in NETWORKS}
     names = [f"{net}.{i}.{part}" for net, n in sizes.items() for i in range(n) for part in ("weight", "bias")]
     wanted = {*names, "low", "high", "observation_mean", "observation_std"}
     if set(tensors) != wanted:
         raise ValueError(f"tensors {sorted(wanted.symmetric_difference(tensors))} are missing or too many")
-    env_id, origin, samples = header.get("env_id"), header.get("origin"), header.get("samples", 1)
-    if (
-        not isinstance(env_id, str)
-        or not isinstance(origin, dict)
-        or not isinstance(samples, int)
-        or not 1 <= samples <= MOST_SAMPLES
-    ):
-        raise ValueError("its header lacks env_id or origin, or has odd samples")
+    env_id, origin = header.get("env_id"), header.get("origin")
+    if not isinstance(env_id, str) or not isinstance(origin, dict):
+        raise ValueError("its header lacks env_id or origin")
     layers, critic = (
         tuple((tensors[f"{net}.{i}.weight"], tensors[f"{net}.{i}.bias"]) for i in range(n)) for net, n in sizes.items()
     )
     mean, std, low, high = (tensors[name] for name in ("observation_mean", "observation_std", "low", "high"))
-    activation = header.get("activation", "relu")
-    if not isinstance(activation, str) or activation not in ACTIVATIONS:
-        raise ValueError(f"unknown activation {activation!r}")
-    policy = Policy(kind, layers, mean, std, low, high, env_id, origin, critic, samples, activation)
+    how = {key: header.get(key, default) for key, default in (("samples", 1), ("activation", "relu"))}
+    policy = Policy(str(header.get("kind")), layers, mean, std, low, high, env_id, origin, critic, **how)
     _check_shapes(policy)
     return policy
 
@@ -245,23 +240,33 @@ def _check_shapes(p: Policy) -> None:
     dim, act = p.observation_mean.shape, p.low.shape
     if any(a.ndim != 1 for a in arrays[:4]) or dim != p.observation_std.shape or act != p.high.shape:
         raise ValueError("the shapes of bounds or normalisation do not agree")
-    if p.kind == "uniform":
-        return
-    if (p.observation_std <= 0).any() or (p.high <= p.low).any():
+    check_networks(p, dim[0], act[0])
+    if p.kind != "uniform" and ((p.observation_std <= 0).any() or (p.high <= p.low).any()):
         raise ValueError("a std is not positive, or bounds are out of order")
-    outputs = act[0] * (1 if p.kind == "tanh" else 2)
-    _check_layers(p.layers, dim[0], outputs)
-    if p.kind == "best_by_q":
-        _check_layers(p.critic, dim[0] + act[0], 1)
 
 
-def _check_layers(layers: Layers, inputs: int, outputs: int) -> None:
+def check_networks(parts: Policy | PolicyParts, observations: int, actions: int) -> None:
+    """Raise ValueError if the kind is unknown, or the layers do not lead from observations to its outputs."""
+    if parts.kind not in KINDS:
+        raise ValueError(f"unknown kind {parts.kind!r}; known: {', '.join(KINDS)}")
+    if not isinstance(parts.activation, str) or parts.activation not in ACTIVATIONS:
+        raise ValueError(f"unknown activation {parts.activation!r}; known: {', '.join(ACTIVATIONS)}")
+    if not isinstance(parts.samples, int) or not 1 <= parts.samples <= MOST_SAMPLES:
+        raise ValueError(f"samples must be a whole number from 1 to {MOST_SAMPLES}, not {parts.samples!r}")
+    if parts.kind == "uniform":
+        return
+    _check_layers(parts.layers, observations, actions * (1 if parts.kind == "tanh" else 2))
+    if parts.kind == "best_by_q":
+        _check_layers(parts.critic, observations + actions, 1)
+
+
+def _check_layers(layers: Sequence[tuple[Any, Any]], inputs: int, outputs: int) -> None:
     if not layers:
         raise ValueError("it has no layers")
     width = inputs
     for weight, bias in layers:
         if weight.ndim != 2 or bias.shape != weight.shape[1:] or weight.shape[0] != width:
-            raise ValueError(f"a layer of shape {weight.shape} does not follow {width} inputs")
+            raise ValueError(f"a layer of shape {tuple(weight.shape)} does not follow {width} inputs")
         width = weight.shape[1]
     if width != outputs:
         raise ValueError(f"{width} outputs where {outputs} are needed")

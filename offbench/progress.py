@@ -40,6 +40,13 @@ class Progress:
             self._bar.initial += done
             self._bar.update(done)
 
+    def say(self, line: str) -> None:
+        """Print a line of its own, above the bar."""
+        if self._bar is not None:
+            self._bar.write(line, file=sys.stderr)
+        else:
+            print(line, file=sys.stderr, flush=True)
+
     def to(self, done: int, note: str = "") -> None:
         """Say that `done` units are done, with a note such as the last score."""
         step, self.done, self._note = done - self.done, done, note or self._note

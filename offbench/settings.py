@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -136,7 +137,7 @@ def _convert(value: Any, hint: Any) -> Any:
 def _convert_one(value: Any, option: Any) -> Any:
     if typing.get_origin(option) is tuple:
         item = typing.get_args(option)[0]
-        parts = value.split(",") if isinstance(value, str) else value
+        parts = re.split("[,x]", value) if isinstance(value, str) else value  # 64x64 as folders are named
         if not isinstance(parts, list | tuple):
             raise TypeError
         return tuple(_convert_one(part, item) for part in parts)
@@ -179,7 +180,9 @@ def _describe(hint: Any) -> str:
     parts = []
     for option in _options(hint):
         if typing.get_origin(option) is tuple:
-            parts.append("a list of whole numbers like 256,256" if int in typing.get_args(option) else "a list")
+            parts.append(
+                "a list of whole numbers like 256,256 or 256x256" if int in typing.get_args(option) else "a list"
+            )
         else:
             parts.append(_WORDS.get(option, str(option)))
     return " or ".join(parts)

@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from offbench.algorithm import Algorithm, stack_configs
+from offbench.algorithm import Algorithm, PolicyParts, check_logs, stack_configs
 from offbench.batches import CHUNK, Member, Store, draw_chunk
 from offbench.errors import OffbenchError
-from offbench.policy import Policy
+from offbench.policy import Policy, check_networks
 
 WARM_UP = 3  # updates of a kind before it is captured: libraries allocate their workspaces in the first ones
 
@@ -77,6 +77,8 @@ class Program:
         batch = self.store.batch(self.indices.index_select(0, self.position)[0])
         noise = {name: values.index_select(0, self.position)[0] for name, values in self.noise.items()}
         logs = self.algorithm.update(batch, noise, kind)
+        if kind not in self._names:
+            check_logs(logs, len(self.store.sizes), f"{type(self.algorithm).__name__}.update")
         for name, value in logs.items():
             if name not in self.sums:
                 self.sums[name] = torch.zeros_like(value)
@@ -105,6 +107,7 @@ class Stack:
             raise OffbenchError(f"datasets of one stack must have the same shapes, not {sorted(dims)}")
         observation_dim, action_dim = dims.pop()
         self.algorithm = kind(config, observation_dim, action_dim, self.seeds, self.device)
+        _check_policy(self.algorithm, observation_dim, action_dim)
         self.batch_size: int = config.batch_size
         self.store = Store(members, config.normalize, self.device)
         self.program = Program(self.algorithm, self.store)
@@ -184,6 +187,20 @@ class Stack:
                 bad = (~torch.isfinite(tensor)).flatten(2).any(2).any(0).nonzero()
                 found |= {int(run): name for run in bad}
         return found
+
+
+def _check_policy(algorithm: Algorithm, observation_dim: int, action_dim: int) -> None:
+    """Raise OffbenchError now, not at the first evaluation, if no policy file can hold the algorithm's policies."""
+    where, parts = f"{type(algorithm).__name__}.policy", algorithm.policy(0)
+    if not isinstance(parts, PolicyParts):
+        raise OffbenchError(f"{where} must return PolicyParts, not a {type(parts).__name__}")
+    try:
+        check_networks(parts, observation_dim, action_dim)
+        ready = not any(x.requires_grad or x.is_cuda for layer in [*parts.layers, *parts.critic] for x in layer)
+    except (ValueError, TypeError, AttributeError) as error:  # the last two: layers that are no pairs of tensors
+        raise OffbenchError(f"{where}: {error}") from None
+    if not ready:
+        raise OffbenchError(f"{where}: layers must be detached and on the CPU, as `Network.layers` returns them")
 
 
 def slice_of(tensors: Mapping[str, Tensor], run: int) -> dict[str, Tensor]:

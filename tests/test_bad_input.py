@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import types
 import warnings
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,15 @@ import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
+import torch
 
 import offbench
-from offbench import dataset
+from offbench import dataset, registry
+from offbench.algorithm import PolicyParts
 from offbench.cli import main
 from offbench.errors import OffbenchError
+from offbench.plots import plot_curves
+from offbench.registry import load_algorithm
 from tests.conftest import TINY_RECIPE
 from tests.test_transitions import episode, foreign
 
@@ -43,10 +48,10 @@ CASES: dict[str, tuple[str, str]] = {
     "collect hopper --mix randm:0.5,expert:0.5": ("unknown level 'randm': did you mean 'random'?", ""),
     "collect hopper --mix medium-expert:0.5,random:0.5": ("--mix takes single levels", ""),
     "collect ./none.toml": ("no recipe file none.toml", ""),
-    "collect hopper --flag": ("unrecognized arguments: --flag", ""),
+    "collect hopper --flag": ("unrecognized arguments: --flag (see `offbench collect --help`)", ""),
     "train": ("the following arguments are required: ALGO, --dataset", "--help"),
     "train bcd --dataset x-v0": ("unknown algorithm 'bcd': did you mean", ""),
-    "train bdb": ("the following arguments are required: --dataset", ""),
+    "train bdb": ("the following arguments are required: --dataset", "`offbench train bdb --help`"),
     "train bdb --dataset x-v0": ("unknown dataset 'x-v0'", "offbench collect"),
     "train bdb --dataset ../x-v0": ("unknown dataset '../x-v0'", ""),
     "train bdb --dataset MEDIUM --beta 2": ("bdb: beta must be at most 1, not 2", ""),
@@ -55,17 +60,33 @@ CASES: dict[str, tuple[str, str]] = {
     "train bdb --dataset MEDIUM --alpha -1": ("alpha must be at least 0", ""),
     "train bdb --dataset MEDIUM --critics 1": ("critics must be at least 2", ""),
     "train bdb --dataset MEDIUM --critics two": ("critics must be a whole number, not 'two'", ""),
-    "train bdb --dataset MEDIUM --hidden 256x256": ("hidden must be a list of whole numbers like 256,256", ""),
+    "train bdb --dataset MEDIUM --hidden 256*256": (
+        "hidden must be a list of whole numbers like 256,256 or",
+        "256x256",
+    ),
+    "train bdb --dataset MEDIUM --hidden 256x": ("hidden must be a list of whole numbers like 256,256 or", "256x256"),
     "train bdb --dataset MEDIUM --normalize perhaps": ("normalize must be true or false, not 'perhaps'", ""),
     "train bdb --dataset MEDIUM --beta-scope world": ("beta_scope must be one of sample, batch", ""),
     "train bdb --dataset MEDIUM --seeds 3:3": ("'3:3' holds no seed", ""),
     "train bdb --dataset MEDIUM --seeds a": ("'a' is not a whole number from 0", ""),
+    "train bdb --dataset MEDIUM --seeds 0-3": ("'0-3' is not a whole number from 0; seeds are 3, 0,1,2 or 0:4", ""),
     "train bdb --dataset MEDIUM --seeds 1,1": ("seeds must be different whole numbers", ""),
     "train bdb --dataset MEDIUM --steps 0": ("'0' is not a whole number from 1", ""),
     "train bdb --dataset MEDIUM --eval-every x": ("'x' is not a whole number from 1", ""),
     "train bdb --dataset MEDIUM --device cuda": ("no device cuda: PyTorch", "--device cpu"),
     "train bdb --dataset MEDIUM --device tpu": ("device must be auto, cpu, cuda or cuda:N, not 'tpu'", ""),
-    "train td3_bc --dataset MEDIUM --beta 0.5": ("unrecognized arguments: --beta 0.5", ""),
+    "train td3_bc --dataset MEDIUM --beta 0.5": (
+        "unrecognized arguments: --beta (see",
+        "`offbench train td3_bc --help`",
+    ),
+    "train td3_bc --dataset MEDIUM --batchsize 3": (
+        "--batchsize: did you mean --batch-size? (see",
+        "train td3_bc --h",
+    ),
+    "train td3_bc --dataset MEDIUM --batchsize=3": ("--batchsize: did you mean --batch-size?", ""),
+    "train td3_bc --datset MEDIUM": ("unrecognized arguments: --datset: did you mean --dataset?", ""),
+    "train td3_bc --dataset MEDIUM --hidden 64 64": ("unrecognized arguments: 64 (see `offbench train td3_bc", ""),
+    "--flag collect hopper": ("unrecognized arguments: --flag (see `offbench --help`)", ""),
     "train bdb --dataset DISCRETE": ("actions must be a Box space, not Discrete(2)", ""),
     "train bdb --dataset NAN": ("rewards hold NaN or infinite numbers", ""),
     "train bdb --dataset MEDIUM DISCRETE": ("actions must be a Box space", ""),
@@ -84,8 +105,20 @@ CASES: dict[str, tuple[str, str]] = {
     "compare td3_bc cql --runs nowhere": ("no evaluated runs below nowhere", ""),
     "train --tensorboard td3_bc --dataset x-v0": ("unknown dataset 'x-v0'", ""),
     "train td3_bc --dataset MEDIUM --wandb": ("argument --wandb: expected one argument", ""),
-    "show x-v0": ("unknown dataset 'x-v0'", ""),
-    "show MEDIM": ("did you mean 'tiny-medium-v0'?", ""),
+    "show x-v0": (
+        "unknown dataset 'x-v0'",
+        "'nan-v0'? Or record one: `offbench collect ENV --level LEVEL`",
+    ),
+    "show xyzzy-v0": ("known: discrete-v0, nan-v0, tiny-medium-v0; record one: `offbench collect ENV", ""),
+    "show hopper-medium-expert-v0": (
+        "hopper-medium-expert-v0 is not recorded yet: `offbench collect hopper --level medium-expert`",
+        "",
+    ),
+    "train td3_bc --dataset hopper-60percent-v0": ("not recorded yet: `offbench collect hopper --level 0.6`", ""),
+    "show inverted-pendulum-random-v0": ("`offbench collect inverted-pendulum --level random`", ""),
+    "show hopper-medium-v2": ("unknown dataset", "`offbench collect hopper --level medium` records hopper-medium-v0"),
+    "show hopper-mediun-v0": ("unknown dataset 'hopper-mediun-v0'", "record one: `offbench collect ENV"),
+    "show MEDIM": ("did you mean 'tiny-medium-v0'? Or record one: `offbench collect", ""),
     "show MEDIUM --plot out.gif": ("a picture's name must end in .png, .svg, .pdf, not 'out.gif'", ""),
     "verify": ("the following arguments are required: ID", ""),
     "verify x-v0": ("unknown dataset 'x-v0'", "offbench collect"),
@@ -112,6 +145,9 @@ CASES: dict[str, tuple[str, str]] = {
     "export MEDIUM --out out.hdf5 --drop-timeouts": ("--drop-timeouts goes with --format npz", ""),
     "export MEDIUM --out .": ("cannot write", ""),
     "export MEDIUM --out empty.safetensors/out.hdf5": ("cannot write", ""),
+    "export MEDIUM --out new/out.hdf5": ("cannot write new/out.hdf5: there is no folder new", ""),
+    "export-policy policy.safetensors --out new/policy.pt": ("there is no folder new", ""),
+    "show MEDIUM --plot new/a.png": ("cannot write new/a.png: there is no folder new", ""),
     "export DISCRETE --out out.hdf5": ("must be a Box space", ""),
     "export-policy nowhere --out policy.pt": ("no policy file nowhere", ""),
     "export-policy . --out policy.pt": ("no policy file policy.safetensors", ""),
@@ -182,6 +218,11 @@ RECIPES: dict[str, tuple[str, str]] = {
         "learning_starts 10,000 leaves none of 4,000 steps",
     ),
     "unknown env": ('env_id = "Hoper-v5"', "cannot make the environment 'Hoper-v5'"),
+    "own env": (
+        'env_id = "Tank-v0"',
+        "doesn't exist. If a module of yours registers it, name it before a colon: my_module:Tank-v0",
+    ),
+    "version": ('env_id = "Hopper-v9"', "[ `v2`, `v3`, `v4`, `v5` ]."),
     "discrete env": ('env_id = "CartPole-v1"', "actions must be a Box space, not Discrete(2)"),
     "env argument": ('env_id = "Hopper-v5"\n[env_kwargs]\nlegs = 3', "cannot make the environment"),
 }
@@ -243,6 +284,58 @@ def test_a_full_disk_is_seen_before_recording(
     assert dataset.local_ids() == []
 
 
+def own(**parts: Any) -> type:
+    """Return TD3+BC with mistakes of one's own: what `update` logs, what `policy` returns."""
+    changed = {name: lambda self, *_, found=found: found(self) for name, found in parts.items()}
+    return type("AWAC", (load_algorithm("td3_bc"),), changed)
+
+
+OWN: dict[str, tuple[type, str]] = {
+    "a number": (
+        own(update=lambda self: {"critic_loss": 0.5}),
+        "AWAC.update: log 'critic_loss' must be a tensor [runs] = [2], got a float",
+    ),
+    "a scalar tensor": (
+        own(update=lambda self: {"q": torch.zeros(())}),
+        "'q' must be a tensor [runs] = [2], got one []",
+    ),
+    "not reduced": (own(update=lambda self: {"q": torch.zeros(2, 8)}), "[runs] = [2], got one [2, 8]"),
+    "a graph": (own(update=lambda self: {"q": self.actor.flat.sum((0, 2))}), "log 'q' must be detached"),
+    "no logs": (own(update=lambda self: None), "AWAC.update must return a dict of logs, not a NoneType"),
+    "a kind": (
+        own(policy=lambda self: PolicyParts("gaussian", self.actor.layers(0))),
+        "AWAC.policy: unknown kind 'gaussian'; known: tanh, squashed_gaussian, best_by_q, uniform",
+    ),
+    "an activation": (
+        own(policy=lambda self: PolicyParts("tanh", self.actor.layers(0), activation="gelu")),
+        "AWAC.policy: unknown activation 'gelu'; known: relu, tanh",
+    ),
+    "outputs": (
+        own(policy=lambda self: PolicyParts("squashed_gaussian", self.actor.layers(0))),
+        "AWAC.policy: 1 outputs where 2 are needed",
+    ),
+    "no critic": (own(policy=lambda self: PolicyParts("best_by_q", self.critic.layers(0)[:0])), "it has no layers"),
+    "no layers": (own(policy=lambda self: PolicyParts("tanh", self.actor)), "AWAC.policy: "),
+    "weights that learn": (
+        own(policy=lambda self: PolicyParts("tanh", [(w.requires_grad_(), b) for w, b in self.actor.layers(0)])),
+        "layers must be detached",
+    ),
+    "no parts": (own(policy=lambda self: self.actor.layers(0)), "AWAC.policy must return PolicyParts, not a list"),
+}
+
+
+@pytest.mark.parametrize("mistake", OWN)
+def test_mistakes_in_ones_own_algorithm_are_said_before_they_cost_time(
+    mistake: str, medium: str, home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kind, message = OWN[mistake]
+    point = types.SimpleNamespace(load=lambda: kind, value="awac:AWAC")
+    monkeypatch.setattr(registry, "_entry_points", lambda: {"awac": point})
+    words = ["--seeds", "0,1", "--steps", "10", "--hidden", "8", "--batch-size", "8", "--workers", "1"]
+    assert message in refusal(["train", "awac", "--dataset", medium, *words], capsys)
+    assert not list(home.rglob("checkpoint-*"))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -266,6 +359,12 @@ def test_an_environment_named_by_a_file_is_not_simply_run(
     with pytest.raises(offbench.OffbenchError, match=message):
         offbench.train("td3_bc", medium, steps=10, hidden=(8,))
     assert not (home / "PWNED").exists()
+
+
+def test_curves_go_into_a_folder_that_is_there(home: Path) -> None:
+    with pytest.raises(offbench.OffbenchError, match=r"cannot write new/a\.png: there is no folder new"):
+        plot_curves("runs", "new/a.png")
+    assert not (home / "new").exists()
 
 
 def test_a_ladder_never_replaces_other_files(tiny: tuple[str, str], home: Path) -> None:

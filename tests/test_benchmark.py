@@ -159,6 +159,22 @@ def test_shards_share_the_runs_and_together_are_the_grid(grid: str, home: Path) 
         assert run.policy_path.read_bytes() == other.policy_path.read_bytes()
 
 
+def test_a_recipe_is_found_beside_its_grid_then_from_here(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (home / "mine").mkdir()
+    text = GRID.replace('"DATASET"', '{id = "tank-v0", env = "tank.toml"}, {id = "pool-v0", env = "envs/pool.toml"}')
+    (home / "mine" / "grid.toml").write_text(text)
+    (home / "mine" / "tank.toml").touch()
+    (home / "tank.toml").touch()
+    assert [source.env for source in load_grid("mine/grid.toml").datasets] == ["mine/tank.toml", "envs/pool.toml"]
+    monkeypatch.chdir("mine")
+    assert load_grid("grid.toml").datasets[0].env == "tank.toml"
+
+
+def test_layers_may_be_written_as_folders_name_them(grid: str, home: Path) -> None:
+    (home / "grid.toml").write_text((home / "grid.toml").read_text().replace("[16, 16]", '"16x16"'))
+    assert {one.config.hidden for one in prepare(grid, workers=1).variants} == {(16, 16)}
+
+
 BAD: dict[str, tuple[str, str]] = {
     "no TOML": ("datasets = [", "not a readable TOML file"),
     "no datasets": ('datasets = []\n[[algorithms]]\nname = "bc"', "datasets must be a list"),

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from offbench.algorithm import Algorithm, Batch, PolicyParts
+from offbench.policy import ACTIVATIONS, KINDS
 from tests.doc_blocks import (
     DOCS,
     LANGUAGES,
@@ -55,6 +57,14 @@ def test_blocks_that_do_not_run_say_why(capsys: pytest.CaptureFixture[str]) -> N
         print(f"\n{sum(block.runs for block in ALL)} blocks of README and docs run; {len(left_out)} do not:")
         for (reason, page), count in sorted(counts.items()):
             print(f"  {count} of {page}: {reason}")
+
+
+def test_the_protocol_is_told_whole() -> None:
+    text = (DOCS / "extending.md").read_text()
+    protocol = ["Config", "learned", "draws", "kind", "update", "policy"]
+    assert all(hasattr(Algorithm, name) or name in Algorithm.__annotations__ for name in protocol)
+    for name in (*protocol, *Batch._fields, *PolicyParts._fields, *KINDS, *ACTIVATIONS):
+        assert re.search(rf"`[^`]*\b{name}\b[^`]*`", text), name
 
 
 def test_no_command_hides_outside_the_blocks_that_run() -> None:

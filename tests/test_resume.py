@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import offbench
-from offbench import checkpoints
+from offbench import checkpoints, cli
 from offbench.agents import folder_of
 from offbench.errors import OffbenchError
 from offbench.recipes import load_recipe
@@ -138,6 +138,37 @@ def test_a_stack_killed_between_two_checkpoints_goes_on_from_the_older(medium: s
         assert a.policy_path.read_bytes() == b.policy_path.read_bytes()
         assert a.evaluations_path.read_bytes() == b.evaluations_path.read_bytes()
     assert first.config()["seed"] == 0
+
+
+@pytest.mark.parametrize("on_a_terminal", [False, True])
+def test_where_runs_go_on_is_said(
+    medium: str, on_a_terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train("td3_bc", medium, "runs", 100, seeds=[0, 1])
+    assert "going on" not in capsys.readouterr().err
+    train("td3_bc", medium, "runs", 200, seeds=[0])
+    capsys.readouterr()
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: on_a_terminal)
+    train("td3_bc", medium, "runs", 200, seeds=[0, 1, 2])
+    lines = capsys.readouterr().err.replace("\r", "\n").splitlines()
+    assert lines[0] == "already finished: 1 of 3 runs"
+    assert [line for line in lines if "going on" in line] == [f"td3_bc on {medium}: going on from step 100"]
+
+
+@pytest.mark.parametrize(("words", "goes_on"), [(["train", "bc"], True), (["show", "x-v0"], False)])
+def test_ctrl_c_promises_only_what_a_command_keeps(
+    words: list[str], goes_on: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(_: list[str]) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_run", stop)
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(words)
+    assert stopped.value.code == 130
+    said = capsys.readouterr().err
+    assert "offbench: stopped" in said
+    assert ("the same command goes on" in said) == goes_on
 
 
 def test_a_finished_run_is_left_alone(medium: str) -> None:

@@ -63,7 +63,7 @@ def test_a_film_of_a_run_plays_its_environment(medium: str, home: Path) -> None:
     import offbench
 
     (run,) = offbench.train("bc", medium, steps=2, eval_every=2, eval_episodes=1, hidden=(8,), workers=1)
-    made = filming.video(run, out=home / "new" / "run.gif", seconds=0.2, size=64)
+    made = filming.video(run, out=home / "run.gif", seconds=0.2, size=64)
     assert len(frames_of(made)) == 6
 
 
@@ -94,13 +94,14 @@ def test_the_users_choice_of_backend_is_put_back(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["hopper:medium", "--out", "film.avi"], ".mp4 or .gif"),
+        (["hopper:medium", "--out", "film.avi"], ".gif or .mp4"),
         (["hopper:medium-expert", "--out", "a.gif"], "not of one policy"),
         (["hopper:medium-replay", "--out", "a.gif"], "not of one policy"),
         (["hopper:mediun", "--out", "a.gif"], "did you mean 'medium'"),
         (["hoper:medium", "--out", "a.gif"], "did you mean 'hopper'"),
         (["ant:medium", "--out", "a.gif"], "no ladder"),
         (["nothing", "--out", "a.gif"], "no policy file"),
+        ([str(POLICY), "--out", "new/a.gif"], "cannot write new/a.gif: there is no folder new"),
         ([str(POLICY), "--env", "hopper", "--out", "a.gif"], "give the right one"),
         ([str(POLICY), "--seconds", "0", "--out", "a.gif"], "more than 0"),
         ([str(POLICY), "--fps", "0", "--out", "a.gif"], "whole number from 1"),
@@ -111,6 +112,41 @@ def test_bad_input_is_one_line(words: list[str], text: str, offbench_cli: Cli, h
     assert done.returncode == 2, done.stdout
     assert len(done.stderr.strip().splitlines()) == 1
     assert text in done.stderr
+    assert not list(home.glob("*.gif"))
+
+
+TANK = """
+import gymnasium as gym
+import numpy as np
+
+
+class Tank(gym.Env):
+    def __init__(self, **options):
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (4,))
+        self.action_space = gym.spaces.Box(-3.0, 3.0, (1,))
+        MODE
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(4, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(4, np.float32), 0.0, False, False, {}
+
+
+gym.register("Tank-v0", "tank:Tank", max_episode_steps=5)
+"""
+
+
+@pytest.mark.parametrize("mode", ["assert not options, options", "self.render_mode = options.get('render_mode')"])
+def test_an_environment_that_does_not_draw_is_one_line(mode: str, home: Path, offbench_cli: Cli) -> None:
+    (home / "tank.py").write_text(TANK.replace("MODE", mode))
+    (home / "tank.toml").write_text('env_id = "tank:Tank-v0"\n')
+    done = offbench_cli("video", str(POLICY), "--env", "./tank.toml")
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("offbench: Tank-v0 cannot be filmed")
+    if "render_mode" in mode:
+        assert line.endswith("it has no rgb_array rendering")
     assert not list(home.glob("*.gif"))
 
 

@@ -41,6 +41,9 @@ COMMANDS: dict[str, tuple[str, Callable[[Parser, list[str]], None]]] = {
 }
 
 
+RESUMED = ("collect", "train", "benchmark", "behaviour")  # that keep checkpoints
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Run one command.
 
@@ -53,7 +56,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(f"offbench: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
-        print("\noffbench: stopped; the same command goes on from the last checkpoint", file=sys.stderr)
+        goes_on = "; the same command goes on from the last checkpoint, or begins again if there is none yet"
+        print(f"\noffbench: stopped{goes_on if _command(words) in RESUMED else ''}", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:  # the reader of a pipe (`| head`) has left
         sys.stderr.close()
@@ -64,7 +68,7 @@ def _run(words: list[str]) -> None:
     parser = Parser(prog="offbench", description="Offline-RL datasets and benchmarks.")
     parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
-    name = next((word for word in words if not word.startswith("-")), None)
+    name = _command(words)
     if name is not None and name not in COMMANDS:
         raise unknown("command", name, COMMANDS)
     for command, (help_, add_arguments) in COMMANDS.items():
@@ -77,6 +81,10 @@ def _run(words: list[str]) -> None:
         return
     run: Callable[..., None] = arguments.pop("run")
     run(**arguments)
+
+
+def _command(words: list[str]) -> str | None:
+    return next((word for word in words if not word.startswith("-")), None)
 
 
 def _version() -> str:

@@ -12,7 +12,7 @@ from offbench.cli.arguments import Parser, natural, number, whole
 def video_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `video`."""
     parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run, a policy file, or ENV:LEVEL (hopper:medium)")
-    parser.add_argument("--out", default="video.mp4", metavar="FILE", help=".mp4 or .gif (default: video.mp4)")
+    parser.add_argument("--out", default="video.gif", metavar="FILE", help=".gif or .mp4 (default: video.gif)")
     parser.add_argument("--env", help="a recipe, instead of the environment the policy names")
     parser.add_argument("--episodes", type=whole, default=1, help="default: 1")
     parser.add_argument("--seconds", type=number, help="length of the film at most (default: whole episodes)")

@@ -3,17 +3,42 @@
 from __future__ import annotations
 
 import argparse
-from typing import NoReturn
+import difflib
+from typing import Any, NoReturn
 
 from offbench.errors import OffbenchError
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose refusals are one line and exit code 2."""
+    """An argument parser whose refusals are one line and exit code 2.
+
+    Attributes:
+        asked: the command whose `--help` a refusal names, where it is not the parser's own.
+    """
+
+    asked = ""
 
     def error(self, message: str) -> NoReturn:
         """Raise the refusal as the error that `main` prints."""
-        raise OffbenchError(f"{message} (see `{self.prog} --help`)")
+        raise OffbenchError(f"{message} (see `{self.asked or self.prog} --help`)")
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse what a command does not know here, where its flags are known, and before what it lacks is said."""
+        if self._subparsers is None:
+            for word in args:
+                self._check_flag(word.partition("=")[0])
+        found, rest = super().parse_known_args(args, namespace)
+        if rest:
+            self.error(f"unrecognized arguments: {' '.join(rest)}")
+        return found, rest
+
+    def _check_flag(self, flag: str) -> None:
+        known = [name for name in self._option_string_actions if name.startswith("--")]
+        if not flag.startswith("--") or any(name.startswith(flag) for name in known):  # argparse takes abbreviations
+            return
+        near = difflib.get_close_matches(flag[2:], [name[2:] for name in known], n=1, cutoff=0.7)
+        hint = f": did you mean --{near[0]}?" if near else ""
+        self.error(f"unrecognized arguments: {flag}{hint}")
 
 
 def whole(text: str) -> int:
@@ -60,9 +85,10 @@ def number(text: str) -> float:
 def seed_list(text: str) -> list[int]:
     """Return the seeds of `3`, `0,1,2` or `0:5` (the end is left out, as in Python)."""
     first, colon, last = text.partition(":")
-    if colon:
-        found = list(range(natural(first), natural(last)))
-        if not found:
-            raise argparse.ArgumentTypeError(f"{text!r} holds no seed")
-        return found
-    return [natural(part) for part in text.split(",")]
+    try:
+        found = list(range(natural(first), natural(last))) if colon else [natural(part) for part in text.split(",")]
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"{error}; seeds are 3, 0,1,2 or 0:4 (0 to 3)") from None
+    if not found:
+        raise argparse.ArgumentTypeError(f"{text!r} holds no seed")
+    return found

@@ -76,9 +76,10 @@ def show_arguments(parser: Parser, _: list[str]) -> None:
         from offbench.describe import show
 
         summary = show(dataset_id)
+        picture = summary.plot(plot) if plot else None
         print("\n".join(summary.lines()))
-        if plot:
-            print(f"histogram in {summary.plot(plot)}", file=sys.stderr)
+        if picture:
+            print(f"histogram in {picture}", file=sys.stderr)
 
     parser.set_defaults(run=run)
 

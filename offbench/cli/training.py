@@ -19,7 +19,13 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
 
     parser.add_argument("algorithm", metavar="ALGO", help=f"one of {', '.join(algorithm_names())}")
     parser.add_argument("--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets")
-    parser.add_argument("--seeds", type=seed_list, default=[0], metavar="LIST", help="3, 0,1,2 or 0:5 (default: 0)")
+    parser.add_argument(
+        "--seeds",
+        type=seed_list,
+        default=[0],
+        metavar="LIST",
+        help="which: 0,1,2 or 0:5 (0 to 4); 3 is the seed 3, where a grid's `seeds = 3` is three (default: 0)",
+    )
     parser.add_argument("--steps", type=whole, default=1_000_000, help="updates (default: 1,000,000)")
     parser.add_argument("--eval-every", type=whole, default=5_000, help="updates between evaluations (default: 5,000)")
     parser.add_argument("--eval-episodes", type=whole, default=10, help="episodes of an evaluation (default: 10)")
@@ -32,15 +38,16 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     if algorithm is None:
         parser.epilog = "`offbench train ALGO --help` shows the algorithm's own settings."
         return
-    group = parser.add_argument_group(f"settings of {algorithm}")
     known = fields(load_algorithm(algorithm).Config)
+    parser.asked = f"offbench train {algorithm}"
+    group = parser.add_argument_group(f"settings of {algorithm}")
     for name, field in known.items():
         several = bool(field.metadata.get("per_run"))
         group.add_argument(
             f"--{name.replace('_', '-')}",
             dest=f"setting_{name}",
             nargs="+" if several else None,
-            metavar="X",
+            metavar="N,N" if isinstance(field.default, tuple) else "X",
             default=argparse.SUPPRESS,
             help=f"{field.metadata.get('help', '')} (default: {_default(field.default)})".replace("%", "%%"),
         )
