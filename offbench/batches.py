@@ -19,6 +19,7 @@ from torch import Tensor
 
 from offbench import seeds
 from offbench.algorithm import Batch, Draw
+from offbench.errors import OffbenchError
 from offbench.runs import Run
 from offbench.seeds import Purpose
 from offbench.transitions import Transitions
@@ -121,6 +122,8 @@ def draw_chunk(
             shape = (CHUNK, *draw.shape)
             if draw.distribution == "normal":
                 noise[name].append(torch.randn(shape, generator=generator, device=device))
-            else:
+            elif draw.distribution == "uniform":
                 noise[name].append(torch.rand(shape, generator=generator, device=device) * 2 - 1)
+            else:
+                raise OffbenchError(f"draws: {name!r} must be normal or uniform, not {draw.distribution!r}")
     return torch.stack(indices, 1), {name: torch.stack(parts, 1) for name, parts in noise.items()}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import types
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,15 +11,12 @@ import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
-import torch
 
 import offbench
-from offbench import dataset, registry
-from offbench.algorithm import PolicyParts
+from offbench import dataset
 from offbench.cli import main
 from offbench.errors import OffbenchError
 from offbench.plots import plot_curves
-from offbench.registry import load_algorithm
 from tests.conftest import TINY_RECIPE
 from tests.test_transitions import episode, foreign
 
@@ -282,58 +278,6 @@ def test_a_full_disk_is_seen_before_recording(
     assert "not enough room" in line
     assert "MINARI_DATASETS_PATH" in line
     assert dataset.local_ids() == []
-
-
-def own(**parts: Any) -> type:
-    """Return TD3+BC with mistakes of one's own: what `update` logs, what `policy` returns."""
-    changed = {name: lambda self, *_, found=found: found(self) for name, found in parts.items()}
-    return type("AWAC", (load_algorithm("td3_bc"),), changed)
-
-
-OWN: dict[str, tuple[type, str]] = {
-    "a number": (
-        own(update=lambda self: {"critic_loss": 0.5}),
-        "AWAC.update: log 'critic_loss' must be a tensor [runs] = [2], got a float",
-    ),
-    "a scalar tensor": (
-        own(update=lambda self: {"q": torch.zeros(())}),
-        "'q' must be a tensor [runs] = [2], got one []",
-    ),
-    "not reduced": (own(update=lambda self: {"q": torch.zeros(2, 8)}), "[runs] = [2], got one [2, 8]"),
-    "a graph": (own(update=lambda self: {"q": self.actor.flat.sum((0, 2))}), "log 'q' must be detached"),
-    "no logs": (own(update=lambda self: None), "AWAC.update must return a dict of logs, not a NoneType"),
-    "a kind": (
-        own(policy=lambda self: PolicyParts("gaussian", self.actor.layers(0))),
-        "AWAC.policy: unknown kind 'gaussian'; known: tanh, squashed_gaussian, best_by_q, uniform",
-    ),
-    "an activation": (
-        own(policy=lambda self: PolicyParts("tanh", self.actor.layers(0), activation="gelu")),
-        "AWAC.policy: unknown activation 'gelu'; known: relu, tanh",
-    ),
-    "outputs": (
-        own(policy=lambda self: PolicyParts("squashed_gaussian", self.actor.layers(0))),
-        "AWAC.policy: 1 outputs where 2 are needed",
-    ),
-    "no critic": (own(policy=lambda self: PolicyParts("best_by_q", self.critic.layers(0)[:0])), "it has no layers"),
-    "no layers": (own(policy=lambda self: PolicyParts("tanh", self.actor)), "AWAC.policy: "),
-    "weights that learn": (
-        own(policy=lambda self: PolicyParts("tanh", [(w.requires_grad_(), b) for w, b in self.actor.layers(0)])),
-        "layers must be detached",
-    ),
-    "no parts": (own(policy=lambda self: self.actor.layers(0)), "AWAC.policy must return PolicyParts, not a list"),
-}
-
-
-@pytest.mark.parametrize("mistake", OWN)
-def test_mistakes_in_ones_own_algorithm_are_said_before_they_cost_time(
-    mistake: str, medium: str, home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    kind, message = OWN[mistake]
-    point = types.SimpleNamespace(load=lambda: kind, value="awac:AWAC")
-    monkeypatch.setattr(registry, "_entry_points", lambda: {"awac": point})
-    words = ["--seeds", "0,1", "--steps", "10", "--hidden", "8", "--batch-size", "8", "--workers", "1"]
-    assert message in refusal(["train", "awac", "--dataset", medium, *words], capsys)
-    assert not list(home.rglob("checkpoint-*"))
 
 
 @pytest.mark.parametrize(
