@@ -16,7 +16,6 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).parent.parent
 OPTIONAL = ("benchmarks.md", "cards/")
 LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#\s]+)(#[^)\s]*)?\)")
-RESULTS = "<!-- results -->"
 
 
 def on_config(config: Any) -> Any:
@@ -45,7 +44,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Mend links, and list the results that are there."""
+    """Mend links."""
 
     def mend(match: re.Match[str]) -> str:
         text, target, place = match[1], match[2], match[3] or ""
@@ -59,11 +58,4 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
             return text
         return f"[{text}]({target}{place})"
 
-    return LINK.sub(mend, markdown.replace(RESULTS, "\n".join(_results())))
-
-
-def _results() -> list[str]:
-    """Return a line for each report below docs/results."""
-    found = sorted((ROOT / "docs" / "results").glob("**/index.html"))
-    lines = [f"- [{p.parent.name}](results/{p.relative_to(ROOT / 'docs' / 'results')})" for p in found]
-    return lines or ["(Nothing has been run to its end yet.)"]
+    return LINK.sub(mend, markdown)
