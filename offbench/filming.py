@@ -11,6 +11,7 @@ import io
 import os
 import warnings
 from collections.abc import Generator, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,8 +82,7 @@ def video(
         rate = float(world.metadata.get("render_fps") or fps)
         every = max(1, round(rate / fps))
         most = seconds * rate if seconds else float("inf")
-        frames = _episodes(world, policy, (seed, episodes), sampled, every, most, size)
-        encode(target, frames, rate / every)
+        encode(target, _episodes(_Film(world, policy, sampled, every, size), seed, episodes, most), rate / every)
     return target
 
 
@@ -130,45 +130,39 @@ def _drawable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
     return env
 
 
-def _episodes(
-    env: gym.Env[Any, Any],
-    policy: Policy,
-    seed_and_count: tuple[int, int],
-    sampled: bool,
-    every: int,
-    most: float,
-    size: int,
-) -> Iterator[Image]:
+@dataclass(frozen=True)
+class _Film:
+    """Who is filmed, whether its actions are sampled, every how many steps, and the longer side in pixels."""
+
+    env: gym.Env[Any, Any]
+    policy: Policy
+    sampled: bool
+    every: int
+    size: int
+
+
+def _episodes(film: _Film, seed: int, count: int, most: float) -> Iterator[Image]:
     """Yield the frames of episode after episode, of `most` steps together."""
-    seed, count = seed_and_count
-    for episode in range(count):
+    for index in range(count):
         if most > 0:
-            most -= yield from _episode(env, policy, (seed, episode), sampled, every, most, size)
+            most -= yield from _episode(film, seed, index, most)
 
 
-def _episode(
-    env: gym.Env[Any, Any],
-    policy: Policy,
-    which: tuple[int, int],
-    sampled: bool,
-    every: int,
-    most: float,
-    size: int,
-) -> Generator[Image, None, int]:
+def _episode(film: _Film, seed: int, index: int, most: float) -> Generator[Image, None, int]:
     """Play one episode; yield every so many steps a frame, and the last; return its steps."""
-    seed, index = which
+    env, policy = film.env, film.policy
     rng = seeds.generator(seed, Purpose.ACTION, *STREAM, index)
-    noisy = policy.needs_noise(not sampled)
+    noisy = policy.needs_noise(not film.sampled)
     observation, _ = env.reset(seed=seeds.integer(seed, Purpose.RESET, *STREAM, index))
     step, total, over = 0, 0.0, False
-    yield _frame(env, step, total, size)
+    yield _frame(env, step, total, film.size)
     while not over:
         noise = policy.draw(rng, 1) if noisy else None
         observation, reward, terminated, truncated, _ = env.step(policy.act(np.asarray(observation)[None], noise)[0])
         step, total = step + 1, total + float(reward)
         over = bool(terminated or truncated or step >= most)
-        if over or step % every == 0:
-            yield _frame(env, step, total, size)
+        if over or step % film.every == 0:
+            yield _frame(env, step, total, film.size)
     return step
 
 

@@ -1,9 +1,8 @@
 """The forward and backward pass of many equal perceptrons, written out.
 
-Autograd would do the same; written out it is half the time. On a CPU every product goes to oneDNN, which on some
-processors is twice as fast as what `@` calls (`make bench` compares them) and applies the activation on its way,
-no pass over an array is made twice, and only the gradients that somebody asks for are computed. On a GPU all
-perceptrons are one batched product a layer.
+Autograd would do the same, slower. On a CPU the larger products go to oneDNN, which on some processors is much faster
+than what `@` calls (`make bench` compares them) and applies the activation on its way, and only the gradients that
+somebody asks for are computed. On a GPU all perceptrons are one batched product a layer.
 
     x [nets, batch, in],  flat [nets, P] = W0 [in, h] | b0 [h] | W1 [h, h] | b1 [h] | ...  ->  [nets, batch, out]
 """
@@ -82,7 +81,7 @@ def _batched(x: Tensor) -> bool:
 
 def _together(parts: list[Tensor], like: Tensor) -> Tensor:
     """Return the groups' results as one tensor [nets, ...]."""
-    return parts[0] if _batched(like) else parts[0].unsqueeze(0) if len(parts) == 1 else torch.stack(parts)
+    return parts[0] if _batched(like) else torch.stack(parts)
 
 
 def _layers(flat: Tensor, sizes: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
@@ -119,7 +118,7 @@ def _onednn(a: Tensor, b: Tensor) -> bool:
     return n > 1 and m * k * n >= (WORTH_IT if k >= 64 else WORTH_IT_WHEN_NARROW)
 
 
-# oneDNN's activation(a @ b.T + bias) of one network: the operation that PyTorch's own compiler calls.
 def _linear(a: Tensor, b: Tensor, bias: Tensor | None, activation: str) -> Tensor:
+    """Return oneDNN's activation(a @ b.T + bias) of one network: the operation that PyTorch's own compiler calls."""
     found: Tensor = torch.ops.mkldnn._linear_pointwise(a, b, bias, activation, [], "")
     return found
