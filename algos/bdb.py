@@ -87,8 +87,8 @@ def critic_loss(
 
 def discriminator_loss(discriminator: Network, pi: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the discriminator's loss [runs], eq. 16: the data's actions are real, the policy's (detached) are not."""
-    real = discriminator(batch.observations, batch.actions)[0].squeeze(-1)
-    fake = discriminator(batch.observations, pi)[0].squeeze(-1)
+    observations, actions = torch.cat([batch.observations] * 2, 1), torch.cat([batch.actions, pi], 1)
+    real, fake = discriminator(observations, actions)[0].squeeze(-1).chunk(2, -1)
     loss = softplus(-real).mean(-1) + softplus(fake).mean(-1)
     seen = {"d_real": real.detach().sigmoid().mean(-1), "d_fake": fake.detach().sigmoid().mean(-1)}
     return loss, {"discriminator_loss": loss.detach()} | seen
@@ -210,7 +210,7 @@ class BDB:
             warm_up = kind == "critic+cloning actor"
             loss, more = actor_loss(pi, self.critic, self.discriminator, self.learned_beta, batch, c, warm_up)
             self.actor.minimize(loss.sum())
-            self.learned_beta.minimize(learned_beta_loss(self.learned_beta, more["bc"], c, warm_up).sum())
+            self.learned_beta.descend(learned_beta_gradient(self.learned_beta, more["bc"], c, warm_up))
             self.actor_target.follow(c.tau)
             self.critic_target.follow(c.tau)
             logs |= more
@@ -224,15 +224,16 @@ class BDB:
 # Ours, beyond the paper; all of it off by default.
 
 
-def learned_beta_loss(learned_beta: Learned, cloning: Tensor, c: Any, warm_up: bool) -> Tensor:
-    """Return the loss [runs] of a learned beta = sigmoid(b): beta (cloning error - target); 0 if it is not learned.
+def learned_beta_gradient(learned_beta: Learned, cloning: Tensor, c: Any, warm_up: bool) -> Tensor:
+    """Return the gradient [1, runs, 1] of beta (cloning error - target), beta = sigmoid(b); 0 if it is not learned.
 
     1 - beta is the multiplier of the constraint "cloning error <= beta_target": an error above the target lowers
     beta, so cloning holds tighter; one below it raises beta, and the discriminator takes over.
     """
     at_work = (c.beta == LEARNED) & (not warm_up)
     error = torch.where(at_work, cloning - c.beta_target, torch.zeros_like(cloning))
-    return learned_beta.flat[0, :, 0].sigmoid() * error
+    beta = learned_beta.flat.detach().sigmoid()
+    return beta * (1 - beta) * error.unsqueeze(-1)
 
 
 def conservative_penalty(critic: Network, actor: Network, batch: Batch, uniform: Tensor) -> Tensor:

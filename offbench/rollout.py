@@ -15,7 +15,7 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any
@@ -30,7 +30,7 @@ from offbench.errors import OffbenchError
 from offbench.policy import Array, Policy, from_bytes
 from offbench.scores import interval
 from offbench.seeds import Purpose
-from offbench.workers import quiet_start, start_worker
+from offbench.workers import closing, quiet_start, start_worker
 
 LANES = 8  # episodes that share a policy forward
 TASK = 16  # episodes that travel together
@@ -148,6 +148,8 @@ def play(task: Task) -> list[Episode] | list[Outcome]:
     lanes = [_Lane(env, policy, task, slot) for env, slot in zip(envs, waiting, strict=False)]
     done: list[Any] = [None] * len(task.indices)
     while lanes:
+        if closing():
+            raise CancelledError
         observations = np.stack([lane.observations[-1] for lane in lanes])
         noise = np.stack([lane.next_noise() for lane in lanes]) if noisy else None
         actions = policy.act(observations, noise)
@@ -194,13 +196,15 @@ class Rollouts:
         self._pool: ProcessPoolExecutor | None = None
         if workers:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(workers, context, start_worker, (os.getpid(),))
+            self._closing = context.Event()
+            self._pool = ProcessPoolExecutor(workers, context, start_worker, (os.getpid(), self._closing))
 
     def __enter__(self) -> Rollouts:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._pool:
+            self._closing.set()  # a second of episodes that nobody will look at
             self._pool.shutdown(wait=True, cancel_futures=True)
 
     def submit(self, task: Task) -> Future[Any]:

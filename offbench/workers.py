@@ -10,6 +10,7 @@ import threading
 import time
 import types
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 from offbench.errors import OffbenchError
 
@@ -54,10 +55,26 @@ def quiet_start() -> Iterator[None]:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def start_worker(parent: int) -> None:
-    """Leave Ctrl-C to the parent, and end when the parent is gone (even by kill -9)."""
+class _Here:
+    """What a worker knows of its pool."""
+
+    closing: Any = None  # an event that the parent sets
+
+
+def start_worker(parent: int, closing: Any = None) -> None:
+    """Leave Ctrl-C to the parent, and end when the parent is gone (even by kill -9).
+
+    Args:
+        closing: an event: nothing that this worker is at is wanted any more.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+    _Here.closing = closing
+
+
+def closing() -> bool:
+    """Return whether nobody waits any more for what this worker is doing."""
+    return _Here.closing is not None and _Here.closing.is_set()
 
 
 def loaded(names: Sequence[str]) -> list[str]:

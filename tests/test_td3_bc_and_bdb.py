@@ -254,17 +254,19 @@ def test_a_learned_beta_holds_the_cloning_error_at_its_target(target: float, ris
     assert (logs[-1] > 0.55) if rises else (logs[-1] < 0.45)
 
 
-def test_the_learned_betas_gradient_by_hand() -> None:
-    """d/db sigmoid(b) (error - target) = sigmoid(b) (1 - sigmoid(b)) (error - target)."""
-    from offbench.algos.bdb import learned_beta_loss
+def test_the_learned_betas_gradient_is_that_of_beta_times_the_excess_error() -> None:
+    from offbench.algos.bdb import learned_beta_gradient
 
-    algorithm = make("bdb", [{"beta": "learned", "beta_target": 0.05}])
+    algorithm = make("bdb", [{"beta": "learned", "beta_target": 0.05}, {"beta": 0.5}])
     with torch.no_grad():
         algorithm.learned_beta.flat.fill_(0.4)
-    loss = learned_beta_loss(algorithm.learned_beta, torch.tensor([0.3]), algorithm.config, False)
-    (gradient,) = torch.autograd.grad(loss.sum(), [algorithm.learned_beta.flat])
-    s = torch.sigmoid(torch.tensor(0.4))
-    torch.testing.assert_close(gradient.flatten(), (s * (1 - s) * 0.25).view(1))
+    cloning = torch.tensor([0.3, 0.3])
+    found = learned_beta_gradient(algorithm.learned_beta, cloning, algorithm.config, False)
+    b = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(b.sigmoid() * 0.25, [b])
+    assert found.shape == algorithm.learned_beta.flat.shape
+    assert found.flatten().tolist() == pytest.approx([gradient.item(), 0.0])  # a fixed beta stands still
+    assert not learned_beta_gradient(algorithm.learned_beta, cloning, algorithm.config, True).any()
 
 
 def test_the_critic_penalty_by_hand() -> None:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import CancelledError
 from pathlib import Path
 
 import gymnasium as gym
@@ -105,6 +106,17 @@ def test_a_killed_worker_is_a_clear_error() -> None:
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(OffbenchError, match="worker process died"):
             result(future)
+
+
+def test_leaving_the_pool_ends_what_is_being_played() -> None:
+    policy = uniform(*BOUNDS, 11, "Hopper-v5")
+    with Rollouts(env_spec("Hopper-v5"), workers=1) as rollouts:
+        few, many = (Task(rollouts.spec, policy.to_bytes(), 0, (), tuple(range(n)), False, True) for n in (1, 10**6))
+        assert len(result(rollouts.submit(few))) == 1
+        future = rollouts.submit(many)
+        while not future.running():
+            time.sleep(0.01)
+    assert isinstance(future.exception(timeout=0), CancelledError)
 
 
 @pytest.mark.slow

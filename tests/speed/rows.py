@@ -27,7 +27,7 @@ class Row:
     at_least: float | None = None
     aim: float | None = None
     seconds: float = 3.0
-    rounds: int = 5
+    rounds: int = 7
     environment: dict[str, str] = field(default_factory=dict)
 
 
