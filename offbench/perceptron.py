@@ -10,7 +10,7 @@ somebody asks for are computed. On a GPU all perceptrons are one batched product
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 
 # Multiplications of a product below which a call of oneDNN costs more than it saves, measured over a range of shapes.
 WORTH_IT, WORTH_IT_WHEN_NARROW = 2**17, 2**21
+Layer = tuple[Tensor, Tensor]  # weight [.., in, out], bias [.., out]
 HAS_ONEDNN: bool = torch._C._has_mkldnn and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
@@ -29,35 +30,45 @@ def perceptrons(flat: Tensor, x: Tensor, sizes: Sequence[int], activation: str) 
         x: inputs [nets, batch, in].
         activation: of the hidden layers, relu or tanh.
     """
-    found: Tensor = _Perceptrons.apply(flat, x, tuple(sizes), activation)  # type: ignore[no-untyped-call]
-    return found
+    if torch.is_grad_enabled() and (flat.requires_grad or x.requires_grad):
+        found: Tensor = _Perceptrons.apply(flat, x, tuple(sizes), activation)  # type: ignore[no-untyped-call]
+        return found
+    return _forward(flat, x, sizes, activation)[0]
+
+
+def _forward(
+    flat: Tensor, x: Tensor, sizes: Sequence[int], activation: str
+) -> tuple[Tensor, list[list[Layer]], list[Tensor]]:
+    """Return the outputs, and what the way back needs: each group's layers, and what went into each of them."""
+    outputs, nets, kept = [], [], []
+    for own, h in _groups(flat, x):
+        nets.append(layers := _layers(own, sizes))
+        kept.append(h)
+        for weight, bias in layers[:-1]:
+            kept.append(h := affine(h, weight, bias, activation))
+        outputs.append(affine(h, *layers[-1], "none"))
+    return _together(outputs, x), nets, kept
 
 
 class _Perceptrons(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, flat: Tensor, x: Tensor, sizes: tuple[int, ...], activation: str) -> Tensor:
-        outputs, kept = [], [flat]
-        for own, h in _groups(flat, x):
-            *hidden, last = _layers(own, sizes)
-            kept.append(h)
-            for weight, bias in hidden:
-                kept.append(h := affine(h, weight, bias, activation))
-            outputs.append(affine(h, *last, "none"))
-        ctx.save_for_backward(*kept)
-        ctx.sizes, ctx.activation = sizes, activation
-        return _together(outputs, x)
+        out, ctx.nets, kept = _forward(flat, x, sizes, activation)
+        ctx.save_for_backward(flat, *kept)  # flat, whose views the layers are: autograd sees if it was changed
+        ctx.activation = activation
+        return out
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         flat, *kept = ctx.saved_tensors
         of_flat, of_x = ctx.needs_input_grad[:2]
-        depth = len(ctx.sizes) - 1
+        depth = len(kept) // len(ctx.nets)
         flat_grads: list[Tensor] = []
         x_grads: list[Tensor] = []
-        for group, (own, grad) in enumerate(_groups(flat, grads[0])):
+        for group, (layers, grad) in enumerate(zip(ctx.nets, _each(grads[0]), strict=True)):
             parts: list[Tensor] = []
-            layers = list(zip(_layers(own, ctx.sizes), kept[group * depth : (group + 1) * depth], strict=True))
-            for layer, ((weight, _), h) in reversed(list(enumerate(layers))):
+            for layer in reversed(range(depth)):
+                weight, h = layers[layer][0], kept[group * depth + layer]
                 if of_flat:
                     parts += [grad.sum(-2), product(h.mT, grad).flatten(-2)]
                 if layer:
@@ -69,9 +80,13 @@ class _Perceptrons(torch.autograd.Function):
         return of_nets, _together(x_grads, flat) if of_x else None, None, None
 
 
-def _groups(flat: Tensor, x: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Return what is computed together, nets and their arrays: all of them, or each without the nets' axis."""
-    return [(flat, x)] if _batched(x) else list(zip(flat.unbind(), x.unbind(), strict=True))
+def _groups(flat: Tensor, x: Tensor) -> Iterable[tuple[Tensor, Tensor]]:
+    """Return what is computed together, nets and their inputs: all of them, or each without the nets' axis."""
+    return zip(_each(flat, x), _each(x), strict=True)
+
+
+def _each(tensor: Tensor, like: Tensor | None = None) -> Sequence[Tensor]:
+    return (tensor,) if _batched(tensor if like is None else like) else tensor.unbind()
 
 
 def _batched(x: Tensor) -> bool:
@@ -84,11 +99,15 @@ def _together(parts: list[Tensor], like: Tensor) -> Tensor:
     return parts[0] if _batched(like) else torch.stack(parts)
 
 
-def _layers(flat: Tensor, sizes: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
-    """Return (weight [.., in, out], bias [.., out]) of each layer, views of `flat` [.., P]."""
-    shapes = list(itertools.pairwise(sizes))
-    parts = iter(flat.split_with_sizes([n for i, o in shapes for n in (i * o, o)], -1))
-    return [(next(parts).view(*flat.shape[:-1], *shape), next(parts)) for shape in shapes]
+def _layers(flat: Tensor, sizes: Sequence[int]) -> list[Layer]:
+    """Return each layer's weight and bias, views of `flat` [.., P]."""
+    outer, strides, first = flat.shape[:-1], flat.stride()[:-1], flat.storage_offset()
+    layers = []
+    for i, o in itertools.pairwise(sizes):
+        weight = flat.as_strided((*outer, i, o), (*strides, o, 1), first)
+        layers.append((weight, flat.as_strided((*outer, o), (*strides, 1), first + i * o)))
+        first += (i + 1) * o
+    return layers
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor, activation: str) -> Tensor:

@@ -84,6 +84,16 @@ def test_shown_parts_of_files_are_there_word_for_word() -> None:
         assert block.content in (DOCS / block.note.removeprefix("part of ")).read_text(), block
 
 
+def test_shown_tables_are_those_that_the_report_wrote() -> None:
+    shown = 0
+    for page in pages():
+        for name, table in re.findall(r"^<!-- table of (\S+) -->\n((?:\|.*\n)+)", page.read_text(), re.M):
+            written = [line for line in (DOCS / name).read_text().splitlines() if line.startswith("|")]
+            assert table.splitlines() == written, f"{page.name}: {name}"
+            shown += 1
+    assert shown
+
+
 def test_the_pages_commands_agree_so_that_one_may_go_from_page_to_page() -> None:
     """The same small dataset and the same evaluations everywhere, or the second page would be refused."""
     text = "\n".join(block.content for page in pages() for block in blocks(page) if not block.reason)

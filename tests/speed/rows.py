@@ -26,8 +26,8 @@ class Row:
     theirs: tuple[str, ...]
     at_least: float | None = None
     aim: float | None = None
-    seconds: float = 3.0
-    rounds: int = 7
+    seconds: float = 2.0
+    rounds: int = 11
     environment: dict[str, str] = field(default_factory=dict)
 
 
