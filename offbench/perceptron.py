@@ -10,7 +10,7 @@ somebody asks for are computed. On a GPU all perceptrons are one batched product
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -41,13 +41,13 @@ def _forward(
 ) -> tuple[Tensor, list[list[Layer]], list[Tensor]]:
     """Return the outputs, and what the way back needs: each group's layers, and what went into each of them."""
     outputs, nets, kept = [], [], []
-    for own, h in _groups(flat, x):
+    for own, h in zip(_each(flat), _each(x), strict=True):
         nets.append(layers := _layers(own, sizes))
         kept.append(h)
         for weight, bias in layers[:-1]:
             kept.append(h := affine(h, weight, bias, activation))
         outputs.append(affine(h, *layers[-1], "none"))
-    return _together(outputs, x), nets, kept
+    return _together(outputs), nets, kept
 
 
 class _Perceptrons(torch.autograd.Function):
@@ -77,26 +77,17 @@ class _Perceptrons(torch.autograd.Function):
                     x_grads.append(product(grad, weight.mT))
             flat_grads += parts[::-1]
         of_nets = torch.cat(flat_grads, -1).view(flat.shape) if of_flat else None
-        return of_nets, _together(x_grads, flat) if of_x else None, None, None
+        return of_nets, _together(x_grads) if of_x else None, None, None
 
 
-def _groups(flat: Tensor, x: Tensor) -> Iterable[tuple[Tensor, Tensor]]:
-    """Return what is computed together, nets and their inputs: all of them, or each without the nets' axis."""
-    return zip(_each(flat, x), _each(x), strict=True)
+def _each(tensor: Tensor) -> Sequence[Tensor]:
+    """Return what is computed together: on a GPU all nets at once; on a CPU one net, for its arrays stay in the cache."""
+    return (tensor,) if tensor.is_cuda else tensor.unbind()
 
 
-def _each(tensor: Tensor, like: Tensor | None = None) -> Sequence[Tensor]:
-    return (tensor,) if _batched(tensor if like is None else like) else tensor.unbind()
-
-
-def _batched(x: Tensor) -> bool:
-    """On a GPU all nets at once; on a CPU one after the other, for one net's arrays stay in the cache."""
-    return x.is_cuda
-
-
-def _together(parts: list[Tensor], like: Tensor) -> Tensor:
+def _together(parts: list[Tensor]) -> Tensor:
     """Return the groups' results as one tensor [nets, ...]."""
-    return parts[0] if _batched(like) else torch.stack(parts)
+    return parts[0] if parts[0].is_cuda else torch.stack(parts)
 
 
 def _layers(flat: Tensor, sizes: Sequence[int]) -> list[Layer]:
