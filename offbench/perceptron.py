@@ -80,14 +80,19 @@ class _Perceptrons(torch.autograd.Function):
         return of_nets, _together(x_grads) if of_x else None, None, None
 
 
+def _batched(tensor: Tensor) -> bool:
+    """On a GPU all nets at once; on a CPU one after the other, for one net's arrays stay in the cache."""
+    return tensor.is_cuda
+
+
 def _each(tensor: Tensor) -> Sequence[Tensor]:
-    """Return what is computed together: on a GPU all nets at once; on a CPU one net, for its arrays stay in the cache."""
-    return (tensor,) if tensor.is_cuda else tensor.unbind()
+    """Return what is computed together: all nets' part of a tensor, or each net's without its axis."""
+    return (tensor,) if _batched(tensor) else tensor.unbind()
 
 
 def _together(parts: list[Tensor]) -> Tensor:
-    """Return the groups' results as one tensor [nets, ...]."""
-    return parts[0] if parts[0].is_cuda else torch.stack(parts)
+    """Undo `_each`."""
+    return parts[0] if _batched(parts[0]) else torch.stack(parts)
 
 
 def _layers(flat: Tensor, sizes: Sequence[int]) -> list[Layer]:
