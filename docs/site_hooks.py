@@ -1,7 +1,6 @@
 """What makes these pages, which are also read on a code server, a site (see mkdocs.yml).
 
 - Dataset cards (datasets/<env>/README.md) become pages below cards/.
-- Pages that a command generates may be missing; links to them become plain text then.
 - Links to source files outside docs/ become plain text.
 """
 
@@ -14,22 +13,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
-OPTIONAL = ("benchmarks.md", "cards/")
 LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#\s]+)(#[^)\s]*)?\)")
-
-
-def on_config(config: Any) -> Any:
-    """Leave out of the contents what is not there."""
-    config["nav"] = _present(config["nav"])
-    return config
-
-
-def _present(item: Any) -> Any:
-    if isinstance(item, list):
-        return [kept for part in item if (kept := _present(part))]
-    if isinstance(item, dict):
-        return {name: kept for name, part in item.items() if (kept := _present(part))}
-    return item if not item.startswith(OPTIONAL) or (ROOT / "docs" / item).exists() else None
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -54,7 +38,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         target = f"cards/{card[1]}/index.md" if card else target
         known = files.get_file_from_path(target)
         outside = target.startswith("../") or page.file.src_uri.startswith("cards/")
-        if known is None and (outside or target.startswith(OPTIONAL)):
+        if known is None and outside:
             return text
         return f"[{text}]({target}{place})"
 

@@ -25,7 +25,6 @@ from tests.doc_blocks import (
     run_page,
 )
 
-OPTIONAL = ("benchmarks.md", "results/", "../datasets/")  # generated
 PAGES = [page for page in pages() if any(block.runs for block in blocks(page)) and page.name != "interop.md"]
 ALL = [block for page in pages() if page.name != "interop.md" for block in blocks(page)]
 
@@ -110,7 +109,7 @@ def test_links_lead_somewhere() -> None:
         text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)
         for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)|(?:src|href)=\"([^\"#]+)", text):
             link = target[0] or target[1]
-            if re.match(r"https?://", link) or link.removeprefix("docs/").startswith(OPTIONAL):
+            if re.match(r"https?://", link):
                 continue
             assert (page.parent / link).exists(), f"{page.name}: {link}"
             count += 1
