@@ -10,7 +10,8 @@ TD3+BC (td3_bc.py) whose constraint is shared by beta between cloning and a GAN 
 D moves just before the actor, its actions pi(s) detached; it works on logits, -log D = softplus(-logit). With
 beta = 0 every number is TD3+BC's, bit for bit. Critics start in agreement, so Unc < 1 and the adaptive beta is
 near 1 at first: the published rule lets the discriminator alone hold the policy until Q has grown.
-Deviations: none known; the paper leaves open whether beta is a sample's or a batch's (`beta_scope`).
+Deviations: lambda is TD3+BC's, by mean |Q_1(s, pi(s))|, as in the authors' code that the paper builds on (its eq. 12
+has the data's actions). The paper leaves open whether beta is a sample's or a batch's (`beta_scope`).
 
 Ours, not the paper's, and off by default (the paper's future work, and remedies for that early beta):
 `uncertainty = relative`, `beta_max`, `cloning_steps`, `beta = learned`, `critic_penalty = cql`; the end of this file.

@@ -13,7 +13,8 @@ critics are pushed down where the policy or chance would act, and up on the data
 
 Deviations: the actor sees the critics after their update, as in SB3 (the authors compute its loss just before), and
 the temperature before its own (theirs is updated first); initial weights are torch.nn.Linear's (rlkit has its own);
-the actor has the critics' three hidden layers, as in their code (Table 5 gives its width alone).
+the actor has the critics' three hidden layers, as in their code (Table 5 gives its width alone); it acts with its
+mode unless `eval_samples` says otherwise (Table 5: the best of 10, as the grid `paper` has it).
 """
 
 from __future__ import annotations

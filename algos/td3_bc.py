@@ -6,8 +6,9 @@ Reference: the authors' code, github.com/sfujim/TD3_BC. TD3 whose actor is also 
              loss = sum_i mean (Q_i(s, a) - y)^2
     actor    loss = -lambda mean Q_1(s, pi(s)) + mean (pi(s) - a)^2,   lambda = alpha / mean |Q_1(s, pi(s))|
 
-The actor and all targets move on every `policy_freq`-th update alone. Deviations: none in the update. Actions are
-scaled to [-1, 1], so the noise needs no factor of the largest action; the initial weights come from NumPy.
+The actor and all targets move on every `policy_freq`-th update alone. Deviations: actions are scaled to [-1, 1], so
+the noise needs no factor of the largest action, and cloning errors count in those units (the same where the bounds
+are 1, as in the locomotion tasks); the initial weights come from NumPy.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Stacked networks: every parameter of one network of all runs lies in one flat tensor.
 
     flat [copies, runs, P]          copies: 1 actor, or the M critics of a run
-      = W0 [.., in, h] | b0 [.., h] | W1 [.., h, h] | b1 [.., h] | ...        (x @ W + b)
+      = W0 [.., in, h] | b0 [.., h] | W1 [.., h, h] | b1 [.., h] | ... | 0      (x @ W + b)
 
 One call serves all copies and runs (offbench.perceptron), and Adam and Polyak are one pass over one tensor. Runs
 share nothing, so the gradient of the runs' summed losses is each run's own gradient.
@@ -16,22 +16,30 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 from torch.optim.adam import adam
 
 from offbench import seeds
 from offbench.perceptron import perceptrons
 from offbench.seeds import Purpose
 
+# What a run learns is stored in multiples of this many numbers, so that each run begins where a processor's wide
+# registers do: loops round what is left at their end differently, and a run must be the same alone and in a stack.
+ALIGNED = 16
+
 
 class Learned:
     """A flat tensor [copies, runs, P] that Adam moves. Runs are axis 1, in every tensor of `tensors()`."""
 
     def __init__(self, flat: Tensor, learning_rate: float) -> None:
-        self.flat, self.learning_rate = flat.requires_grad_(), learning_rate
+        self._spare = -flat.shape[-1] % ALIGNED
+        self._whole = pad(flat, (0, self._spare)) if self._spare else flat
+        self.flat = self._whole[..., : flat.shape[-1]].requires_grad_()
+        self.learning_rate = learning_rate
         self.state: dict[str, Tensor] = {
             "step": torch.zeros((), dtype=torch.float32, device=flat.device),
-            "exp_avg": torch.zeros_like(flat, requires_grad=False),
-            "exp_avg_sq": torch.zeros_like(flat, requires_grad=False),
+            "exp_avg": torch.zeros_like(self._whole),
+            "exp_avg_sq": torch.zeros_like(self._whole),
         }
 
     def minimize(self, loss: Tensor, retain_graph: bool = False) -> None:
@@ -43,8 +51,8 @@ class Learned:
     def descend(self, grad: Tensor) -> None:
         """Take one Adam step down a gradient [copies, runs, P]: torch's function, its class costs twice the time."""
         adam(
-            [self.flat],
-            [grad],
+            [self._whole],
+            [pad(grad, (0, self._spare)) if self._spare else grad],
             [self.state["exp_avg"]],
             [self.state["exp_avg_sq"]],
             [],
@@ -61,7 +69,7 @@ class Learned:
 
     def tensors(self) -> dict[str, Tensor]:
         """Return what a checkpoint keeps, each [copies, runs, P] but for the step count."""
-        return {"flat": self.flat.detach(), **self.state}
+        return {"flat": self._whole, **self.state}
 
 
 class Network(Learned):
@@ -96,6 +104,7 @@ class Network(Learned):
         rng = seeds.generator(seed, Purpose.WEIGHTS, index, copy)
         bounds = [1 / math.sqrt(i) for i, o in self._shapes for _ in range(2)]
         parts = [rng.uniform(-b, b, n) for b, n in zip(bounds, self._splits, strict=True)]
+        parts.append(np.zeros(-sum(self._splits) % ALIGNED))
         return np.concatenate(parts).astype(np.float32)
 
     def __call__(self, *inputs: Tensor) -> Tensor:
@@ -117,7 +126,7 @@ class Network(Learned):
 
     def layers(self, run: int) -> list[tuple[Tensor, Tensor]]:
         """Return (weight [in, out], bias [out]) of each layer of one run's first copy, on the CPU."""
-        parts = iter(torch.split(self.flat.detach()[0, run].cpu(), self._splits))
+        parts = iter(torch.split(self.flat.detach()[0, run, : sum(self._splits)].cpu(), self._splits))
         return [(next(parts).view(i, o).clone(), next(parts).clone()) for i, o in self._shapes]
 
 

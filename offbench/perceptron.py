@@ -4,7 +4,7 @@ Autograd would do the same, slower. On a CPU the larger products go to oneDNN, w
 than what `@` calls (`make bench` compares them) and applies the activation on its way, and only the gradients that
 somebody asks for are computed. On a GPU all perceptrons are one batched product a layer.
 
-    x [nets, batch, in],  flat [nets, P] = W0 [in, h] | b0 [h] | W1 [h, h] | b1 [h] | ...  ->  [nets, batch, out]
+    x [nets, batch, in],  flat [nets, P] = W0 [in, h] | b0 [h] | W1 [h, h] | b1 [h] | ... | 0  ->  [nets, batch, out]
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def perceptrons(flat: Tensor, x: Tensor, sizes: Sequence[int], activation: str) 
     """Return the outputs [nets, batch, out] of perceptrons with layers of `sizes`, differentiable once.
 
     Args:
-        flat: all weights and biases [nets, P].
+        flat: all weights and biases [nets, P]; what lies behind the last bias has no effect.
         x: inputs [nets, batch, in].
         activation: of the hidden layers, relu or tanh.
     """
@@ -55,7 +55,7 @@ class _Perceptrons(torch.autograd.Function):
     def forward(ctx: Any, flat: Tensor, x: Tensor, sizes: tuple[int, ...], activation: str) -> Tensor:
         out, ctx.nets, kept = _forward(flat, x, sizes, activation)
         ctx.save_for_backward(flat, *kept)  # flat, whose views the layers are: autograd sees if it was changed
-        ctx.activation = activation
+        ctx.activation, ctx.used = activation, sum((i + 1) * o for i, o in itertools.pairwise(sizes))
         return out
 
     @staticmethod
@@ -63,10 +63,11 @@ class _Perceptrons(torch.autograd.Function):
         flat, *kept = ctx.saved_tensors
         of_flat, of_x = ctx.needs_input_grad[:2]
         depth = len(kept) // len(ctx.nets)
+        behind = flat.new_zeros(*flat.shape[:-1], flat.shape[-1] - ctx.used)
         flat_grads: list[Tensor] = []
         x_grads: list[Tensor] = []
-        for group, (layers, grad) in enumerate(zip(ctx.nets, _each(grads[0]), strict=True)):
-            parts: list[Tensor] = []
+        for group, (layers, grad, rest) in enumerate(zip(ctx.nets, _each(grads[0]), _each(behind), strict=True)):
+            parts = [rest]
             for layer in reversed(range(depth)):
                 weight, h = layers[layer][0], kept[group * depth + layer]
                 if of_flat:

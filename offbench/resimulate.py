@@ -21,7 +21,7 @@ from offbench.rollout import kept_envs
 STEPS = 40  # of an episode that are replayed one by one
 WHOLE, CLOSE, ROUNDED = 1e-9, 1e-6, 1e-4  # tolerances: same physics, other version, observations kept as float32
 CLIPPED_VELOCITY = 10.0  # Hopper and Walker2d report no velocity beyond it: the state is not known there
-SHARE = 0.01  # of the replayed steps that rounding may carry across a contact or a limit
+SHARE = 0.01  # of the replayed steps, or one of them, that rounding may carry across a contact or a limit
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def _one_step(env: gym.Env[Any, Any], state: _State, e: Recorded, exact: bool, l
         observation, reward, ended[i], *_ = env.step(e.actions[t])
         moved[i] = _far(observation, seen[t + 1], state, tolerance)
         paid[i] = abs(float(reward) - float(e.rewards[t])) > tolerance * (1 + abs(float(reward)))
-    allowed = SHARE * len(steps) if rounded else 0
+    allowed = max(1, SHARE * len(steps)) if rounded else 0
     early = ended & (steps != last)
     moved &= ~early  # what follows an end is another episode
     if moved.sum() > allowed:

@@ -75,7 +75,7 @@ def test_the_papers_grid_is_its_table() -> None:
         "bdb beta=0.5",
         "bdb beta=0.75",
         "bdb",
-        "cql",
+        "cql eval_samples=10",
     ]
     assert {source.env for source in bench.grid.datasets} == {"hopper", "halfcheetah", "walker2d"}
     assert {source.level for source in bench.grid.datasets} == set(offbench.inventory()["levels"])

@@ -68,7 +68,7 @@ def test_a_run_alone_equals_the_same_run_in_a_stack(medium: str) -> None:
         (alone,) = train("bdb", medium, "alone", 200, seeds=run.config()["seed"])
         ours, theirs = (load_file(r.folder / "checkpoint-000000200.safetensors") for r in (run, alone))
         for name in ours:
-            torch.testing.assert_close(ours[name], theirs[name], atol=1e-4, rtol=0)
+            assert torch.equal(ours[name], theirs[name]), name
 
 
 def test_new_seeds_leave_finished_ones_alone(medium: str) -> None:
@@ -80,7 +80,7 @@ def test_new_seeds_leave_finished_ones_alone(medium: str) -> None:
     for a, b in zip(whole, train("td3_bc", medium, "runs", 200, seeds=[0, 1, 2]), strict=True):
         ours, theirs = (load_file(run.folder / "checkpoint-000000200.safetensors") for run in (a, b))
         for name in ours:
-            torch.testing.assert_close(ours[name], theirs[name], atol=1e-4, rtol=0)
+            assert torch.equal(ours[name], theirs[name]), name
         assert b.evaluations().keys() == {100, 200}
     assert first.policy_path.stat().st_mtime_ns == before
 
@@ -116,7 +116,7 @@ def test_two_datasets_in_a_stack_equal_each_alone(tiny: tuple[str, str], medium:
         (alone,) = train("bdb", config["dataset"], "alone", 200, seeds=config["seed"])
         ours, theirs = (load_file(r.folder / "checkpoint-000000200.safetensors") for r in (run, alone))
         for name in ours:
-            torch.testing.assert_close(ours[name], theirs[name], atol=1e-4, rtol=0)
+            assert torch.equal(ours[name], theirs[name]), name
 
 
 def test_a_learned_beta_beside_a_fixed_one_resumes_right(medium: str) -> None:
@@ -127,7 +127,7 @@ def test_a_learned_beta_beside_a_fixed_one_resumes_right(medium: str) -> None:
     for a, b in zip(whole, together, strict=True):
         ours, theirs = (load_file(run.folder / "checkpoint-000000200.safetensors") for run in (a, b))
         for name in ours:
-            torch.testing.assert_close(ours[name], theirs[name], atol=1e-4, rtol=0)
+            assert torch.equal(ours[name], theirs[name]), name
 
 
 def test_a_stack_killed_between_two_checkpoints_goes_on_from_the_older(medium: str) -> None:

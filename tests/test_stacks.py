@@ -42,9 +42,9 @@ def finish(jobs: list[Job]) -> None:
 
 @pytest.mark.slow
 def test_two_processes_train_what_one_does(medium: str) -> None:
-    """Stacks of one run each, so that the sums in a matrix product are the same: the bits must be too."""
-    one = offbench.train("bdb", medium, steps=200, runs="one", seeds=[0, 1, 2], workers=1, stack=1, **SMALL, **TIMES)
-    two = offbench.train("bdb", medium, steps=200, runs="two", seeds=[0, 1, 2], workers=2, stack=1, **SMALL, **TIMES)
+    """A stack of three against stacks of two and one: the same bits."""
+    one = offbench.train("bdb", medium, steps=200, runs="one", seeds=[0, 1, 2], workers=1, **SMALL, **TIMES)
+    two = offbench.train("bdb", medium, steps=200, runs="two", seeds=[0, 1, 2], workers=2, **SMALL, **TIMES)
     for a, b in zip(map(Run, one), map(Run, two), strict=True):
         assert a.policy_path.read_bytes() == b.policy_path.read_bytes()
         assert a.evaluations_path.read_bytes() == b.evaluations_path.read_bytes()
