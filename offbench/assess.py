@@ -87,7 +87,7 @@ def evaluate(
     played = json.loads(spec)["id"]
     # a run's own references hold for its own environment alone
     known = config.get("references") if same_environment(config.get("env_spec"), spec) else None
-    known = known or {"dataset": shipped_references(played), "d4rl": d4rl_constants(played)}
+    known = known or {"dataset": shipped_references(spec), "d4rl": d4rl_constants(played)}
     scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in known.items() if pair}
     return Evaluation(str(path), played, returns, [o.length for o in outcomes], scores)
 

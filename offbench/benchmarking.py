@@ -2,7 +2,7 @@
 
 grid -> plan: runs, stacks, expected hours, disk (offbench.planning)
      -> datasets that are missing are recorded
-     -> runs cut into parts -> a shard's parts -> what is left of them -> jobs -> an executor
+     -> a shard's runs -> cut into parts -> what is left of them -> jobs -> an executor
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Protocol
 
+import numpy as np
+
 from offbench.errors import OffbenchError
 from offbench.grid import Source, Times
-from offbench.jobs import Job, complain, run_jobs
-from offbench.planning import Benchmark, Variant, plan, prepare
+from offbench.jobs import Job, Order, complain, run_jobs
+from offbench.planning import Benchmark, plan, prepare
 from offbench.record import record_source
 from offbench.stacking import Part, cut, diverged, pending, with_evaluators
 from offbench.training import Schedule
@@ -67,7 +69,7 @@ def benchmark(
         grid: a shipped grid's name (paper, paper-small, smoke), a file (`./mine.toml`), or what
             `offbench.planning.prepare` returns, which takes the folder, the device and the processes.
         budget: "9m", "2h" or "90s": stops cleanly after that time; the same call goes on.
-        shard: (i, n): the i-th of n shares of the stacks, for machines with a shared file system.
+        shard: (i, n): the i-th of n shares of the runs, for machines with a shared file system.
         executor: where it happens: this machine (default), or a cluster (offbench.cluster.RayExecutor).
         command: what the user typed, for each run's config.json.
         say: takes the plan, line by line.
@@ -113,15 +115,29 @@ def _seconds(text: str) -> float:
 
 def _parts(bench: Benchmark, shard: tuple[int, int]) -> list[tuple[Part, Schedule]]:
     """Return this shard's parts. Runs of equal times are cut together, whatever their algorithm."""
+    by_times: dict[Times, list[Order]] = {}
+    for one, orders in zip(bench.variants, shared(bench, shard), strict=True):
+        by_times.setdefault(replace(one.times, seeds=()), []).extend(orders)
+    found = []
+    for times, orders in by_times.items():
+        schedule = Schedule(times.steps, times.eval_every, times.eval_episodes, bench.device, workers=0)
+        found += [(part, schedule) for part in cut(orders, bench.device, bench.processes, bench.stack)]
+    return found
+
+
+def shared(bench: Benchmark, shard: tuple[int, int]) -> list[list[Order]]:
+    """Return a shard's runs of each variant: of each its share, by the grid alone, for machines differ.
+
+    Raises:
+        OffbenchError: there is no such shard.
+    """
     place, count = shard
     if not 0 <= place < count:
         raise OffbenchError(f"a shard is i/n with i from 0 to n - 1, not {place}/{count}")
-    by_times: dict[Times, list[Variant]] = {}
+    found, first = [], 0
     for one in bench.variants:
-        by_times.setdefault(replace(one.times, seeds=()), []).append(one)
-    found = []
-    for times, variants in by_times.items():
-        orders = [order for one in variants for order in bench.orders(one)]
-        schedule = Schedule(times.steps, times.eval_every, times.eval_episodes, bench.device, workers=0)
-        found += [(part, schedule) for part in cut(orders, bench.device, bench.processes * count, bench.stack)]
-    return found[place::count]
+        orders = bench.orders(one)
+        mine = np.array_split(np.arange(len(orders)), count)[(place - first) % count]
+        found.append([orders[i] for i in mine])
+        first += len(orders)  # the first few have one more: next time the shares behind them
+    return found

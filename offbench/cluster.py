@@ -16,19 +16,21 @@ import shutil
 import socket
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from offbench import checkpoints, dataset
+from offbench import dataset
 from offbench.errors import OffbenchError
 from offbench.files import write_bytes
 from offbench.grid import Source
 from offbench.jobs import Board, Job, Order, is_over, perform
 from offbench.record import record_source
 from offbench.runs import Run
+from offbench.stacking import finished
 
 SLICE = 600.0  # seconds that a task trains before it hands back
 RETRIES = 5  # times that Ray runs a lost task again
@@ -136,8 +138,8 @@ def left(job: Job) -> tuple[Order, ...]:
     """Return the runs of a job that have neither come to their last step nor diverged."""
 
     def over(order: Order) -> bool:
-        folder = Path(order.folder)
-        return Run(folder).diverged or job.schedule.steps in checkpoints.steps(folder)
+        run = Run(Path(order.folder))
+        return run.diverged or finished(run, job.schedule.steps)
 
     return tuple(order for order in job.orders if not over(order))
 
@@ -280,3 +282,5 @@ def _task(work: Callable[[], list[str]], title: str) -> tuple[bool, list[str]]:
         return True, work()
     except OffbenchError as error:
         return False, [f"{title}: {error}"]
+    except Exception:  # a fault of ours or of a third party's algorithm: the driver shows it whole
+        return False, [f"{title}: {traceback.format_exc()}"]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.resources
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,10 @@ from typing import Any
 from offbench import dataset
 from offbench.errors import OffbenchError, unknown
 from offbench.levels import parse_level
+from offbench.recipes import load_recipe
 from offbench.settings import build, setting
+
+MOST_SEEDS = 100_000  # beyond this a count is a slip, and would fill the memory
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,7 @@ def load_grid(name: str) -> Grid:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise OffbenchError(f"no grid file {path}; shipped are {', '.join(shipped_grids())}") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # not UTF-8, not TOML, a number of 5000 digits, a bomb
         raise OffbenchError(f"{where}: not a readable TOML file ({error})") from None
     sources = _list(values.pop("datasets", []), "datasets", where)
     entries = _list(values.pop("algorithms", []), "algorithms", where)
@@ -116,9 +119,9 @@ def _times(values: dict[str, Any], default: Times, where: str) -> Times:
     """Return `default` with what `values` says otherwise."""
     whole = dataclasses.asdict(default) | values
     seeds = whole.pop("seeds")
-    if isinstance(seeds, int) and not isinstance(seeds, bool) and seeds > 0:
+    if isinstance(seeds, int) and not isinstance(seeds, bool) and 0 < seeds <= MOST_SEEDS:
         seeds = range(seeds)
-    bad = isinstance(seeds, int | str) or any(type(s) is not int or s < 0 for s in seeds)
+    bad = not isinstance(seeds, Sequence) or any(type(s) is not int or s < 0 for s in seeds)
     if bad or len(set(seeds)) != len(seeds) or not len(seeds):
         raise OffbenchError(f"{where}: seeds must be a count or a list of different whole numbers, not {seeds!r}")
     return build(Times, whole | {"seeds": tuple(seeds)}, where)
@@ -135,7 +138,10 @@ def _source(value: Any, folder: Path, where: str) -> Source:
         return dataclasses.replace(source, env=env, level=source.level or ("medium" if env else ""))
     if not isinstance(value, str):
         raise OffbenchError(f"{where}: datasets must be ids or tables, not {value!r}")
-    return Source(dataset.check_id(value), *dataset.recorded_by(value))
+    env, level = dataset.recorded_by(dataset.check_id(value))
+    if env and value.rpartition("-v")[2] != str(load_recipe(env).version):
+        return Source(value)  # another version's, such as one of D4RL's: known if it is here, never recorded
+    return Source(value, env, level)
 
 
 def _entry(value: Any, times: Times, where: str) -> Entry:

@@ -12,18 +12,16 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from offbench.environments import same_environment
 from offbench.errors import OffbenchError
 from offbench.files import read_json
 from offbench.policy import Policy, load_policy
 from offbench.recipes import Recipe, load_recipe, names
 from offbench.scores import normalize
-
-if TYPE_CHECKING:
-    pass
 
 MEDIUM = 1 / 3  # of the expert's normalised return
 MEDIUM_AT_MOST = 0.45  # a rung beyond this is no medium while there is another
@@ -127,11 +125,14 @@ def read_ladder(folder: Path) -> Ladder | None:
     return ladder
 
 
-def shipped_references(env_id: str) -> tuple[float, float] | None:
-    """Return the (random, expert) returns shipped for an environment id; None if there is no ladder of it."""
+def shipped_references(spec: str) -> tuple[float, float] | None:
+    """Return the (random, expert) returns shipped for an environment (EnvSpec JSON); None if there are none of it."""
     for name in names():
         recipe = load_recipe(name)
-        if recipe.env_id == env_id and recipe.folder and (ladder := read_ladder(recipe.folder / "behaviour")):
+        # the id first: making the spec of every recipe takes a while
+        if recipe.env_id != json.loads(spec).get("id") or not same_environment(recipe.env_spec(), spec):
+            continue
+        if recipe.folder and (ladder := read_ladder(recipe.folder / "behaviour")):
             return ladder.random_return, ladder.expert_return
     return None
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from offbench import checkpoints, dataset
+from offbench import dataset
 from offbench.calibrate import Rate, measure, operations, step_seconds
 from offbench.devices import pick_device
 from offbench.errors import OffbenchError
@@ -22,6 +22,7 @@ from offbench.progress import duration
 from offbench.recipes import Recipe, load_recipe
 from offbench.registry import load_algorithm
 from offbench.runs import Run, run_folder, settings_dict, variant
+from offbench.stacking import finished
 from offbench.wording import counted
 from offbench.workers import default_workers
 
@@ -127,7 +128,10 @@ def plan(bench: Benchmark) -> Iterator[str]:
     specs = specs or {"": _known_spec(bench.grid.datasets[0])}
     spec = next(iter(specs.values()))  # for the shapes, which differ little
     runs = {one: bench.orders(one) for one in bench.variants}
-    left = {one: [order for order in orders if not _done(order, one.times)] for one, orders in runs.items()}
+    left = {
+        one: [order for order in orders if not finished(Run(Path(order.folder)), one.times.steps)]
+        for one, orders in runs.items()
+    }
     sizes = {"dataset": len(bench.grid.datasets), "variant": len(runs), "run": sum(map(len, runs.values()))}
     words = ", ".join(counted(size, noun) for noun, size in sizes.items())
     yield f"{bench.grid.name}: {words}, {_count(left)} to train"
@@ -161,10 +165,6 @@ def plan(bench: Benchmark) -> Iterator[str]:
             f"  on a GPU: not measured here; {products:.2g} operations in matrix products, which take {hours} "
             f"if it does {GPU_SPEED / 1e12:.0f} Tflop/s of them"
         )
-
-
-def _done(order: Order, times: Times) -> bool:
-    return times.steps in checkpoints.steps(Path(order.folder))
 
 
 def _count(left: Mapping[Variant, Sequence[Order]]) -> int:

@@ -195,7 +195,7 @@ class _Recording:
         if part.source in ("medium", "expert"):
             rung = self.ladder.role(part.source)
             fraction = self.ladder.fraction(rung)
-            if part.source == "medium" and not MEDIUM <= round(fraction, 2) <= MEDIUM_AT_MOST:
+            if part.source == "medium" and not MEDIUM <= fraction <= MEDIUM_AT_MOST:
                 print(
                     f"offbench: medium of {self.recipe.name} lies at {fraction:.2f} of the expert's return: "
                     f"no rung of the training lies from {MEDIUM:.2f} to {MEDIUM_AT_MOST}",

@@ -18,6 +18,7 @@ from offbench.batches import CHUNK, Member, Store, draw_chunk
 from offbench.errors import OffbenchError
 from offbench.policy import Policy, check_networks
 
+Sums = list[tuple[str, float, int]]  # of each logged quantity: its name, its sum, and over how many updates
 WARM_UP = 3  # updates of a kind before it is captured: libraries allocate their workspaces in the first ones
 
 
@@ -93,6 +94,16 @@ class Program:
             total.zero_()
         self.counts = {}
         return means
+
+    def unlogged(self, run: int) -> Sums:
+        """Return one run's sum and count of what has been logged since `logged` was called."""
+        return [(name, float(self.sums[name][run]), count) for name, count in self.counts.items()]
+
+    def go_on_logging(self, run: int, sums: Sums) -> None:
+        """Put `unlogged` sums back."""
+        for name, total, count in sums:
+            self.sums.setdefault(name, torch.zeros(len(self.store.sizes), device=self.device))[run] = total
+            self.counts[name] = count
 
 
 class Stack:

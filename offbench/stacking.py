@@ -23,7 +23,7 @@ from offbench.jobs import Job, Order
 from offbench.provenance import hardware, versions, warn_other_physics
 from offbench.recipes import d4rl_constants
 from offbench.registry import load_algorithm
-from offbench.runs import FORMAT, settings_dict, variant
+from offbench.runs import FORMAT, Run, settings_dict, variant
 from offbench.settings import fields
 from offbench.training import Schedule
 from offbench.workers import default_workers
@@ -126,6 +126,13 @@ def with_evaluators(jobs: Sequence[Job], workers: int) -> list[Job]:
     ]
 
 
+def finished(run: Run, steps: int) -> bool:
+    """Return whether a run has come to its end: a checkpoint at step `steps`, and an evaluation unless it has none."""
+    if steps not in checkpoints.steps(run.folder) or not run.config_path.exists():
+        return False
+    return not run.config().get("env_spec") or steps in run.evaluations()
+
+
 def together(members: Sequence[Member], steps: int) -> list[list[Member]]:
     """Sort runs into stacks that can go on from one common step; runs without a checkpoint begin together.
 
@@ -138,9 +145,8 @@ def together(members: Sequence[Member], steps: int) -> list[list[Member]]:
     left, groups = [], []
     for member in members:
         found = known[member.run.folder]
-        evaluated = not member.data.env_spec or steps in member.run.evaluations()
-        if steps in found and evaluated:
-            continue  # finished: left alone
+        if finished(member.run, steps):
+            continue  # left alone
         if found and max(found) > steps:
             raise OffbenchError(
                 f"{member.run.folder} is at step {max(found)} already; give --steps {max(found)} or more, or --runs"

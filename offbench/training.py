@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -107,7 +108,7 @@ class Trainer:
         """Train up to `stop`; return False if the deadline came first."""
         for step in self.stack.train(stop):
             late = self.schedule.deadline is not None and time.time() > self.schedule.deadline and step < stop
-            if step % LOG_EVERY == 0 or step == stop or late:
+            if step % LOG_EVERY == 0 or step == stop:
                 for rows, row in zip(self.losses, self.stack.logged(), strict=True):
                     rows.append({"step": step, **row})
             self._arrived()
@@ -147,8 +148,9 @@ class Trainer:
         for step in sorted((s for s in common if s <= self.schedule.steps), reverse=True):
             found = [checkpoints.load_checkpoint(m.run.folder, step) for m in self.members]
             if all(found):
-                for run, (tensors, _) in enumerate(f for f in found if f):
+                for run, (tensors, state) in enumerate(f for f in found if f):
                     self.stack.load(run, tensors)
+                    self.stack.program.go_on_logging(run, state.get("unlogged", []))
                 self.stack.step = step
                 break
         for run, member in enumerate(self.members):
@@ -168,7 +170,12 @@ class Trainer:
                 member.run.write_evaluations(self.evaluations[run])
                 member.run.write_losses(self.losses[run])
                 self.stack.policy(run).save(member.run.policy_path)
-                checkpoints.save_checkpoint(folder, step, slice_of(tensors, run), {"step": step})
+                state: dict[str, Any] = {"step": step}
+                if unlogged := self.stack.program.unlogged(
+                    run
+                ):  # stopped by the clock, between two rows of losses.csv
+                    state["unlogged"] = unlogged
+                checkpoints.save_checkpoint(folder, step, slice_of(tensors, run), state)
                 checkpoints.keep_newest(folder)
         self._show()
         self._saved = time.monotonic()

@@ -101,6 +101,9 @@ CASES: dict[str, tuple[str, str]] = {
     "compare td3_bc": ("the following arguments are required: B", "--help"),
     "compare td3_bc cql --runs nowhere": ("no evaluated runs below nowhere", ""),
     "train --tensorboard td3_bc --dataset x-v0": ("unknown dataset 'x-v0'", ""),
+    "train --tensorb td3_bc --dataset x-v0": ("unknown dataset 'x-v0'", ""),
+    "train --seeds=0,1 td3_bc --dataset x-v0": ("unknown dataset 'x-v0'", ""),
+    "train --dataset x-v0 -- td3_bc": ("unknown dataset 'x-v0'", ""),
     "train td3_bc --dataset MEDIUM --wandb": ("argument --wandb: expected one argument", ""),
     "show x-v0": (
         "unknown dataset 'x-v0'",

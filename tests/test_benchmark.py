@@ -17,7 +17,7 @@ import pytest
 
 import offbench
 from offbench import dataset
-from offbench.benchmarking import benchmark
+from offbench.benchmarking import benchmark, shared
 from offbench.calibrate import operations
 from offbench.cli import main
 from offbench.errors import OffbenchError
@@ -148,15 +148,28 @@ def test_a_budget_that_ends_before_any_evaluation_is_no_error(grid: str, capsys:
 
 
 def test_shards_share_the_runs_and_together_are_the_grid(grid: str, home: Path) -> None:
-    benchmark(prepare(grid, workers=1, runs="whole", stack=1), say=silent)
+    """Machines that differ, too: the shares are the grid's, and a run's bits do not depend on its stack."""
+    benchmark(prepare(grid, workers=1, runs="whole"), say=silent)
     for place in range(3):
-        benchmark(prepare(grid, workers=1, runs="shared", stack=1), shard=(place, 3), say=silent)
+        benchmark(prepare(grid, workers=1 + place, runs="shared"), shard=(place, 3), say=silent)
         counted = len([run for run in find_runs(home / "shared") if run.evaluations()])
-        assert counted == (2, 3, 4)[place]  # four stacks of one run dealt to three
+        assert counted == (2, 3, 4)[place]  # two runs of each of two variants, dealt to three
     for run in find_runs(home / "whole"):
         other = Run(home / "shared" / run.folder.relative_to(home / "whole"))
         assert run.evaluations() == other.evaluations()
         assert run.policy_path.read_bytes() == other.policy_path.read_bytes()
+
+
+@pytest.mark.parametrize("count", [2, 7, 16])
+def test_shares_of_the_papers_grid_are_even_and_leave_none_out(count: int) -> None:
+    bench = prepare("paper", workers=1)
+    whole = sorted(order.folder for one in bench.variants for order in bench.orders(one))
+    shares = [[order.folder for orders in shared(bench, (i, count)) for order in orders] for i in range(count)]
+    assert sorted(folder for share in shares for folder in share) == whole
+    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+    for i in range(count):
+        of_each = [len(orders) for orders in shared(bench, (i, count))]
+        assert max(of_each) - min(of_each) <= 1  # some of every algorithm
 
 
 def test_a_recipe_is_found_beside_its_grid_then_from_here(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,6 +197,19 @@ BAD: dict[str, tuple[str, str]] = {
         'datasets = ["a-v0"]\nseeds = [1, 1]\n[[algorithms]]\nname = "bc"',
         "seeds must be a count or a list",
     ),
+    "half a seed": (
+        'datasets = ["a-v0"]\nseeds = 1.5\n[[algorithms]]\nname = "bc"',
+        "seeds must be a count or a list",
+    ),
+    "seeds on a day": (
+        'datasets = ["a-v0"]\nseeds = 2026-01-01\n[[algorithms]]\nname = "bc"',
+        "seeds must be a count or a list",
+    ),
+    "a seed too many": (
+        'datasets = ["a-v0"]\nseeds = 1000000000000\n[[algorithms]]\nname = "bc"',
+        "seeds must be a count or a list",
+    ),
+    "a number of 5000 digits": (f'datasets = ["a-v0"]\nsteps = {"1" * 5000}', "not a readable TOML file"),
     "no seeds": ('datasets = ["a-v0"]\nseeds = 0\n[[algorithms]]\nname = "bc"', "seeds must be a count or a list"),
     "bad steps": ('datasets = ["a-v0"]\nsteps = 0\n[[algorithms]]\nname = "bc"', "steps must be at least 1"),
     "bad id": ('datasets = ["a"]\n[[algorithms]]\nname = "bc"', "is not a dataset id"),
@@ -238,7 +264,8 @@ def test_a_shard_beyond_the_last_is_refused(grid: str) -> None:
     ("text", "env", "level"),
     [
         ("hopper-medium-replay-v0", "hopper", "medium-replay"),
-        ("inverted-pendulum-60percent-v1", "inverted-pendulum", "0.6"),
+        ("inverted-pendulum-60percent-v0", "inverted-pendulum", "0.6"),
+        ("hopper-medium-v2", "", ""),  # D4RL's: ours has another version
         ("hopper-12p5percent-v0", "hopper", "0.125"),
         ("D4RL/hopper/medium-v2", "", ""),
     ],

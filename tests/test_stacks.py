@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -50,6 +49,18 @@ def test_two_processes_train_what_one_does(medium: str) -> None:
         assert a.evaluations_path.read_bytes() == b.evaluations_path.read_bytes()
 
 
+def test_a_deadline_within_a_training_changes_no_file(medium: str, home: Path) -> None:
+    schedule = Schedule(400, 400, 2, "cpu", 0)
+    finish(jobs_of(orders(medium, "whole", 2), schedule, 1))
+    over = replace(schedule, deadline=0.0)  # looked at every 100 updates
+    for step in (100, 200, 300, 400):
+        finish(jobs_of(orders(medium, "cut", 2), over, 1))
+        assert all(checkpoints.steps(Path(order.folder))[0] == step for order in orders(medium, "cut", 2))
+    for one, other in zip(orders(medium, "whole", 2), orders(medium, "cut", 2), strict=True):
+        for name in ("evaluations.csv", "losses.csv", "policy.safetensors", "checkpoint-000000400.safetensors"):
+            assert (Path(one.folder) / name).read_bytes() == (Path(other.folder) / name).read_bytes(), name
+
+
 def test_stacks_are_cut_for_the_processes_and_by_size(medium: str) -> None:
     schedule = Schedule(100, 100, 2, "cpu", 0)
 
@@ -92,20 +103,6 @@ def test_a_stack_that_goes_on_has_the_same_runs_as_before(medium: str) -> None:
     finish(jobs_of(orders(medium, "runs", 4), schedule, 2)[:1])
     (job,) = jobs_of(orders(medium, "runs", 4), schedule, 2)
     assert [order.seed for order in job.orders] == [2, 3]
-
-
-def test_a_deadline_leaves_a_checkpoint_that_goes_on_to_the_same_end(medium: str) -> None:
-    schedule = Schedule(1000, 500, 2, "cpu", 0)
-    finish(jobs_of(orders(medium, "whole", 2), schedule, 1))
-    (job,) = jobs_of(orders(medium, "runs", 2), schedule, 1)
-    perform(replace(job, schedule=replace(schedule, deadline=time.time())), lambda step, note: None)
-    folder = Path(job.orders[0].folder)
-    assert checkpoints.steps(folder) == [100]  # the first chunk was done when it looked at the clock
-    finish(jobs_of(orders(medium, "runs", 2), schedule, 1))
-    for a, b in zip(orders(medium, "whole", 2), orders(medium, "runs", 2), strict=True):
-        ours, theirs = Run(Path(a.folder)), Run(Path(b.folder))
-        assert ours.policy_path.read_bytes() == theirs.policy_path.read_bytes()
-        assert ours.evaluations() == theirs.evaluations()
 
 
 def test_a_run_that_diverges_is_marked_and_the_others_go_on(medium: str) -> None:

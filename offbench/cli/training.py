@@ -32,11 +32,10 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     _machine(parser)
     parser.add_argument("--tensorboard", action="store_true", help="write event files beside each run")
     parser.add_argument("--wandb", metavar="PROJECT", help="show the runs in a Weights & Biases project")
-    pairs = zip(["", *words], words, strict=False)
-    positions = [word for before, word in pairs if not before.startswith("--") or before in SWITCHES]
-    algorithm = next((word for word in positions if not word.startswith("-")), None)
+    algorithm = _algorithm(words)
     if algorithm is None:
         parser.epilog = "`offbench train ALGO --help` shows the algorithm's own settings."
+        parser.set_defaults(run=lambda **_: parser.error("name the algorithm first: offbench train ALGO --dataset ID"))
         return
     known = fields(load_algorithm(algorithm).Config)
     parser.asked = f"offbench train {algorithm}"
@@ -63,6 +62,15 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         print(f"next: offbench normalize --runs {rest['runs']}")
 
     parser.set_defaults(run=run)
+
+
+def _algorithm(words: list[str]) -> str | None:
+    """Return the first word that is neither a flag nor a flag's value."""
+    for before, word in zip(["", *words], words, strict=False):
+        taken = before.startswith("--") and "=" not in before and not any(s.startswith(before) for s in SWITCHES)
+        if not taken and not word.startswith("-"):
+            return word
+    return None
 
 
 def _machine(parser: Parser) -> None:

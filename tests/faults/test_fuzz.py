@@ -29,6 +29,7 @@ from offbench.d4rl import import_d4rl
 from offbench.describe import Summary
 from offbench.errors import OffbenchError
 from offbench.ladder import read_ladder
+from offbench.planning import prepare
 from offbench.policy import Policy, load_policy
 from offbench.provenance import warn_other_physics
 from offbench.recipes import read_recipe, shipped
@@ -234,8 +235,19 @@ def _d4rl() -> bytes:
         return path.read_bytes()
 
 
+GRID = b'datasets = ["hopper-medium-v0", {id = "x-v0", env = "hopper", level = "0.5", steps = 5}]\nseeds = [0, 2]\n'
+GRID += b'steps = 5\neval_every = 5\n[[algorithms]]\nname = "bdb"\nbeta = [0.5, "adaptive"]\nsteps = 1_000\n'
+
+
+def grid(folder: Path, data: bytes) -> object:
+    path = folder / "grid.toml"
+    path.write_bytes(data)
+    return prepare(str(path), workers=1)
+
+
 READERS: dict[str, tuple[Reader, st.SearchStrategy[bytes]]] = {
     "recipe": (recipe, spoiled_words(RECIPE, " \n=[],")),
+    "grid": (grid, spoiled_words(GRID, " \n=[],")),
     "policy": (policy, spoiled_tensors(_policy())),
     "checkpoint": (checkpoint, spoiled_tensors(_checkpoint())),
     "metadata": (metadata, spoiled_json(_metadata())),
@@ -273,6 +285,7 @@ def fuzz(name: str, folder: Path, cases: int) -> tuple[int, int]:
 def test_a_sound_file_is_read(name: str, home: Path) -> None:
     sound = {
         "recipe": RECIPE,
+        "grid": GRID,
         "policy": _policy(),
         "checkpoint": _checkpoint(),
         "metadata": _metadata(),
