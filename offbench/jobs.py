@@ -103,7 +103,7 @@ def perform(job: Job, report: Report) -> list[str]:
     loaded = {name: transitions.load(name) for name in dict.fromkeys(order.dataset for order in job.orders)}
     members = [order.member(loaded[order.dataset], job.kind) for order in job.orders]
     with arithmetic(job.schedule.device, job.tf32):
-        return Trainer(load_algorithm(job.kind), members, job.schedule).train(report)
+        return Trainer(load_algorithm(job.kind), members, job.schedule, job.tf32).train(report)
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> list[str]:

@@ -30,6 +30,11 @@ def hardware() -> dict[str, Any]:
     return {"hardware": {"processor": _processor(), "cores": os.cpu_count(), "machine": platform.machine()}}
 
 
+def made_with(device: str, tf32: bool) -> dict[str, Any]:
+    """Return what a training's numbers depend on beside its settings and seed."""
+    return {"device": device, "tf32": tf32, "versions": versions(), **hardware()}
+
+
 def _processor() -> str:
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():

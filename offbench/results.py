@@ -201,7 +201,6 @@ def read_results(root: str | Path) -> Results:
     waiting = []
     for run in find_runs(Path(root)):
         config, evaluations = run.config(), run.evaluations()
-        _check(run, config)
         if not evaluations:
             waiting.append(run)
             continue
@@ -214,25 +213,12 @@ def read_results(root: str | Path) -> Results:
     for (dataset, content, algorithm, variant), runs in groups.items():
         runs.sort(key=lambda trained: trained.seed)
         _check_seeds(runs)
-        beta = runs[0].config["settings"].get("beta") if isinstance(runs[0].config["settings"], dict) else None
+        beta = runs[0].config["settings"].get("beta")
         beta = f"{beta:.2f}" if isinstance(beta, int | float) else beta
         task, method = tasks[dataset, content], Method(algorithm, variant, beta)
         entries[task, method] = Entry(task, method, tuple(runs))
     methods = sorted({method for _, method in entries}, key=_method_order)
     return Results(Path(root), tuple(sorted(tasks.values(), key=_task_order)), tuple(methods), entries, tuple(waiting))
-
-
-def _check(run: Run, config: Mapping[str, Any]) -> None:
-    """Raise OffbenchError if a config holds something else than the training wrote."""
-    references, whole = config["references"], ("seed", "steps")
-    good = isinstance(references, dict) and all(type(config[key]) is int for key in whole)
-    for name in ("dataset", "d4rl"):
-        pair = references.get(name) if isinstance(references, dict) else None
-        if pair is not None:
-            numbers = isinstance(pair, list) and [type(end) in (int, float) for end in pair] == [True, True]
-            good = good and numbers and pair[0] < pair[1]
-    if not good:
-        raise OffbenchError(f"{run.config_path} is damaged: seed, steps or references; delete the run to repeat it")
 
 
 def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[Trained]]) -> dict[tuple[str, str], Task]:

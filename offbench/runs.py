@@ -1,7 +1,8 @@
 """Run directories: plain files that a person can read, and that `normalize` and `report` need nothing beside.
 
 runs/<dataset>/<algorithm>/<variant>/seed-<n>/
-    config.json           settings, dataset and its references, seed, versions, command
+    config.json           settings, dataset and its references, seed, versions, hardware, command; `sessions`: what
+                          trained it later, where that was something else
     evaluations.csv       step, episode, return, length: every evaluation episode
     losses.csv            step and the mean of each logged quantity since the row before
     policy.safetensors    the policy at the last checkpoint
@@ -62,10 +63,13 @@ class Run:
                 raise OffbenchError(
                     f"{self.config_path} is damaged: it lacks {key}, or has an odd one; delete the run to repeat it"
                 )
+        parts = config.get("sessions", [])
+        if not (isinstance(parts, list) and all(isinstance(part, dict) for part in parts)):
+            raise OffbenchError(f"{self.config_path} is damaged: odd sessions; delete the run to repeat it")
         config["references"] = {name: config["references"].get(name) for name in ("dataset", "d4rl")}
         for pair in config["references"].values():
             sound = isinstance(pair, list) and len(pair) == 2 and all(_is(value, float) for value in pair)
-            if pair is not None and not (sound and pair[0] != pair[1]):
+            if pair is not None and not (sound and pair[0] < pair[1]):
                 raise OffbenchError(f"{self.config_path} is damaged: odd references; delete the run to repeat it")
         return dict(config)
 
@@ -83,8 +87,21 @@ class Run:
                         f"{self.folder} holds a run with {key} {known.get(key)!r}, not {config[key]!r}; "
                         "delete it or give another --runs"
                     )
-            config = {**known, "steps": max(int(config["steps"]), int(known["steps"]))}
-        write_json(self.config_path, config)
+        else:
+            write_json(self.config_path, config)
+
+    def begin(self, step: int, steps: int, made: Mapping[str, Any]) -> None:
+        """Note in config.json that the run is trained from `step` to `steps`, and with what, if that has changed.
+
+        Args:
+            made: device, versions and so on (offbench.provenance.made_with).
+        """
+        config = self.config()
+        changed = dict(config, steps=max(steps, config["steps"]))
+        if {key: sessions(config)[-1].get(key) for key in made} != made:
+            changed["sessions"] = [*config.get("sessions", []), {"step": step, **made}]
+        if changed != config:
+            write_json(self.config_path, changed)
 
     def mark_diverged(self, step: int, tensor: str) -> None:
         """Note that the run cannot go on: `tensor` held NaN or infinity at `step`."""
@@ -155,6 +172,11 @@ def _is(value: Any, kind: type) -> bool:
 
 def _short(value: Any) -> Any:
     return f"{value:.6g}" if isinstance(value, float) else value
+
+
+def sessions(config: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return what has trained a run, one after the other: each has device, versions, hardware and so on."""
+    return [config, *config.get("sessions", [])]
 
 
 def find_runs(root: Path) -> list[Run]:

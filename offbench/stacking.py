@@ -20,7 +20,7 @@ from offbench.devices import stack_size
 from offbench.environments import checked_spec, same_environment
 from offbench.errors import OffbenchError
 from offbench.jobs import Job, Order
-from offbench.provenance import hardware, versions, warn_other_physics
+from offbench.provenance import made_with, warn_other_physics
 from offbench.recipes import d4rl_constants
 from offbench.registry import load_algorithm
 from offbench.runs import FORMAT, Run, settings_dict, variant
@@ -183,9 +183,6 @@ def _config(order: Order, member: Member, schedule: Schedule, tf32: bool, comman
         },
         "env_id": data.env_id,
         "env_spec": data.env_spec,
-        "device": schedule.device,
-        "tf32": tf32,
         "command": command,
-        "versions": versions(),
-        **hardware(),
+        **made_with(schedule.device, tf32),
     }

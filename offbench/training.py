@@ -22,6 +22,7 @@ from offbench.algorithm import Algorithm
 from offbench.batches import Member
 from offbench.files import disk_errors, sole
 from offbench.loggers import NOWHERE, Destinations, Loggers
+from offbench.provenance import made_with
 from offbench.rollout import Outcome, Rollouts, result
 from offbench.runs import Run
 from offbench.scores import normalize
@@ -60,8 +61,11 @@ class Schedule:
 class Trainer:
     """A stack with its files: checkpoints, losses, evaluations beside the training."""
 
-    def __init__(self, kind: type[Algorithm], members: Sequence[Member], schedule: Schedule) -> None:
+    def __init__(
+        self, kind: type[Algorithm], members: Sequence[Member], schedule: Schedule, tf32: bool = False
+    ) -> None:
         self.members, self.schedule = list(members), schedule
+        self.made = made_with(schedule.device, tf32)
         self.stack = Stack(kind, members, schedule.device)
         self.loggers = Loggers([member.run for member in members], schedule.show)
         self.evaluations: list[dict[int, list[tuple[float, int]]]] = [{} for _ in members]
@@ -82,6 +86,8 @@ class Trainer:
             for member in self.members:
                 resources.enter_context(held(member.run))
             self._resume()
+            for member in self.members:
+                member.run.begin(self.stack.step, self.schedule.steps, self.made)
             resources.enter_context(self.loggers)
             spec = self.members[0].data.env_spec  # datasets of one stack are of one environment
             if spec:

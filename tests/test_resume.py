@@ -205,6 +205,21 @@ def test_another_run_in_the_same_place_is_refused(tiny: tuple[str, str], medium:
         train("td3_bc", medium, "runs", 200)
 
 
+def test_what_trained_a_run_later_is_noted_if_it_is_something_else(
+    medium: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (run,) = train("td3_bc", medium, "runs", 100)
+    train("td3_bc", medium, "runs", 200)
+    assert "sessions" not in run.config()
+    elsewhere = {"device": "cuda", "tf32": True, "versions": {"torch": "9"}, "hardware": {"cores": 99}}
+    monkeypatch.setattr("offbench.training.made_with", lambda *_: elsewhere)
+    for steps in (300, 400):
+        train("td3_bc", medium, "runs", steps)
+    config = run.config()
+    assert config["sessions"] == [{"step": 200, **elsewhere}]
+    assert (config["device"], config["steps"]) == ("cpu", 400)
+
+
 def test_divergence_is_said_and_the_last_checkpoint_kept(medium: str) -> None:
     train("td3_bc", medium, "runs", 100)
     (run,) = (Run(path.parent) for path in Path("runs").rglob("config.json"))

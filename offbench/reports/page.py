@@ -7,13 +7,14 @@ import hashlib
 import importlib.resources
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from offbench.reports.figures import Figure, Line
 from offbench.reports.layout import Cell, Table
 from offbench.reports.markup import Markup, breakable, join, tag
 from offbench.reports.tables import cell_id
-from offbench.results import REFERENCES, Entry, Results, Trained
-from offbench.runs import Run
+from offbench.results import REFERENCES, Entry, Results
+from offbench.runs import Run, sessions
 from offbench.scores import run_return
 
 
@@ -146,15 +147,15 @@ def _box(results: Results, entry: Entry, name: str) -> Markup:
     references = [
         f"{REFERENCES[key]}: {pair[0]:g} to {pair[1]:g}" for key, pair in first["references"].items() if pair
     ]
-    settings = first["settings"] if isinstance(first["settings"], dict) else {}
+    parts = [part for trained in entry.runs for part in sessions(trained.config)]
     facts = {
         "dataset": f"{task.dataset}, content {task.content}",
         "references": "; ".join(references) or "none",
         "evaluation": f"every {first.get('eval_every', 0):,} updates, {first.get('eval_episodes', 0)} episodes",
         "commands": "\n".join(commands),
-        "versions": _several([_words(trained.config.get("versions")) for trained in entry.runs]),
-        "hardware": _several([_hardware(trained) for trained in entry.runs]),
-        "settings": ", ".join(f"{key} {value}" for key, value in settings.items()) or "none",
+        "versions": _several([_words(part.get("versions")) for part in parts]),
+        "hardware": _several([_hardware(part) for part in parts]),
+        "settings": ", ".join(f"{key} {value}" for key, value in first["settings"].items()) or "none",
     }
     title = f"{entry.method.label} on {task.name}"
     terms = [part for key, text in facts.items() for part in (tag("dt", key), tag("dd", breakable(text)))]
@@ -200,8 +201,9 @@ def _words(found: object) -> str:
     return ", ".join(f"{key} {value}" for key, value in found.items()) if isinstance(found, Mapping) else "unknown"
 
 
-def _hardware(trained: Trained) -> str:
-    return f"{trained.config.get('device', 'unknown device')}; {_words(trained.config.get('hardware'))}"
+def _hardware(part: Mapping[str, Any]) -> str:
+    tf32 = ", TF32" if part.get("tf32") else ""
+    return f"{part.get('device', 'unknown device')}{tf32}; {_words(part.get('hardware'))}"
 
 
 def _several(texts: Sequence[str]) -> str:
