@@ -15,8 +15,10 @@ import offbench
 from offbench import assess, transitions
 from offbench.cli import main
 from offbench.files import write_json
+from offbench.registry import load_algorithm
 from offbench.reports.tables import published
-from offbench.results import Method, Task, read_results
+from offbench.results import OURS, Method, Task, read_results
+from offbench.settings import fields
 from tests.made_runs import METHODS, made_grid, made_run
 from tests.pages import Page, rows
 
@@ -113,6 +115,9 @@ def test_environment_and_level_of_a_dataset(dataset: str, place: tuple[str, str]
 def test_the_published_numbers_are_found_by_method() -> None:
     assert Method("bdb", "beta=0.5", "0.50").published == "bdb beta=0.50"
     known = {row["method"] for row in published("scores")}
+    assert Method("bdb", "beta_max=0.5", "adaptive").published == ""  # no paper has it
+    options = fields(load_algorithm("bdb").Config)
+    assert {name for name, field in options.items() if field.metadata["help"].startswith("ours")} == OURS
     assert {"td3_bc", "cql", "bdb beta=0.50", "bdb beta=adaptive"} <= known
     assert Method("bdb", "hidden=8x8", "adaptive").label == "bdb beta=adaptive,hidden=8x8"
 

@@ -332,3 +332,4 @@ main(["train", "td3_bc", "--dataset", {medium!r}, "--steps", "200", "--eval-ever
         found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=dict(os.environ))
     assert found.returncode == 2
     assert f"is being trained by process {os.getpid()} on {socket.gethostname()}" in found.stderr
+    assert run.config()["steps"] == 100  # who was refused has changed nothing

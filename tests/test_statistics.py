@@ -13,6 +13,7 @@ from scipy import stats
 
 from offbench.errors import OffbenchError
 from offbench.statistics import Estimate, curve, improvement, iqm, paired, profile
+from tests import few_seeds
 
 # Two tasks, two seeds each, few enough that every resample can be listed.
 TINY = {"one": [0.0, 4.0], "two": [10.0, 20.0]}
@@ -200,3 +201,12 @@ def test_intervals_against_scipys_bootstrap(rng: np.random.Generator) -> None:
     ours = iqm(scores)
     assert (ours.low, ours.high) == pytest.approx(tuple(theirs.confidence_interval), abs=0.02)
     assert ours == iqm(scores)  # drawn with a fixed generator
+
+
+@pytest.mark.slow
+def test_what_few_seeds_can_tell_is_as_the_page_says() -> None:
+    written = few_seeds.FILE.read_text().splitlines()[2:]
+    assert [[cell.strip() for cell in line.split("|")[1:-1]][:2] for line in written] == [
+        [str(tasks), str(seeds)] for tasks, seeds in few_seeds.SIZES
+    ]
+    assert written[1] == "| " + " | ".join(few_seeds.row(*few_seeds.SIZES[1])) + " |"

@@ -47,7 +47,7 @@ RESUMED = ("collect", "train", "benchmark", "behaviour")  # that keep checkpoint
 def main(argv: Sequence[str] | None = None) -> None:
     """Run one command.
 
-    Exits with 0, 1 if `verify` found something, 2 for a problem the user can mend, 130 after Ctrl-C.
+    Exits with 0, 1 if `verify` or `doctor` found something, 2 for a problem the user can mend, 130 after Ctrl-C.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:

@@ -87,7 +87,7 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
 
     parser.add_argument("grid", metavar="GRID", help=f"{', '.join(shipped_grids())}, or a grid file")
     parser.add_argument("--plan", action="store_true", help="print runs, cost and disk, and do nothing")
-    parser.add_argument("--budget", metavar="TIME", help="stop cleanly after 90s, 9m or 2h; the same command goes on")
+    parser.add_argument("--budget", metavar="TIME", help="stop training cleanly after 90s, 9m or 2h")
     parser.add_argument("--shard", type=share, default=(0, 1), metavar="I/N", help="the I-th of N shares, I from 0")
     parser.add_argument("--executor", choices=("local", "ray"), default="local", help="default: local processes")
     parser.add_argument(
