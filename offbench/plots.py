@@ -8,13 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from offbench.errors import OffbenchError
 from offbench.files import output_file, write_bytes
-from offbench.runs import DIGITS, Run
-from offbench.scores import normalize
-from offbench.tables import ambiguous, evaluated_groups
+from offbench.results import read_results
+from offbench.statistics import curve
 
 FORMATS = ("png", "svg", "pdf")
 
@@ -50,32 +47,24 @@ def save(fig: Any, path: Path) -> Path:
 
 
 def plot_curves(runs: str | Path, path: str | Path) -> Path:
-    """Draw the score of every variant below a folder against updates: mean and range over seeds, a panel a dataset.
+    """Draw the score of every variant below a folder against updates: mean and 95% interval, a panel a dataset.
 
     Raises:
         OffbenchError: there are no evaluated runs, or the picture cannot be written.
     """
     path = picture_file(path)
-    groups = evaluated_groups(runs)
-    twins = ambiguous(groups)
-    titles = {key: f"{key[0]} ({key[3][:DIGITS]})" if key[0] in twins else key[0] for key in groups}
-    datasets = list(dict.fromkeys(titles.values()))
-    with figure(len(datasets)) as (fig, panels):
-        for key, group in groups.items():
-            axes = panels[datasets.index(titles[key])]
-            pair = group[0][1]["references"]["dataset"]
-            curves = [_curve(run, pair) for run, _ in group]
-            steps = sorted(set.intersection(*(set(curve) for curve in curves)))
-            values = np.array([[curve[step] for step in steps] for curve in curves])
-            name = f"{key[1]} {key[2]}".removesuffix(" default")
-            (line,) = axes.plot(steps, values.mean(0), marker="o", markersize=3, label=name)
-            axes.fill_between(steps, values.min(0), values.max(0), color=line.get_color(), alpha=0.15, linewidth=0)
-            axes.set(title=titles[key], xlabel="updates", ylabel="normalized score" if pair else "return")
+    results = read_results(runs)
+    with figure(len(results.tasks)) as (fig, panels):
+        for (task, method), entry in results.entries.items():
+            axes = panels[results.tasks.index(task)]
+            steps, values = entry.common_curve()
+            points = curve(values)
+            (line,) = axes.plot(steps, [p.value for p in points], marker="o", markersize=3, label=method.label)
+            if points and points[0].low is not None:
+                low, high = [p.low for p in points], [p.high for p in points]
+                axes.fill_between(steps, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
+            unit = "normalized score" if task.reference else "return"
+            axes.set(title=task.name, xlabel="updates", ylabel=unit)
         for axes in panels:
             axes.legend(frameon=False, fontsize="small")
         return save(fig, path)
-
-
-def _curve(run: Run, pair: tuple[float, float] | None) -> dict[int, float]:
-    means = {step: float(np.mean([value for value, _ in rows])) for step, rows in run.evaluations().items()}
-    return {step: normalize(mean, *pair) if pair else mean for step, mean in means.items()}

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -202,28 +202,39 @@ def read_results(root: str | Path) -> Results:
     Raises:
         OffbenchError: none is evaluated, one is damaged, or one is there twice.
     """
+    entries, waiting = entries_of(find_runs(Path(root)))
+    if not entries:
+        raise OffbenchError(f"no evaluated runs below {root}; start one with `offbench train ALGO --dataset ID`")
+    tasks = sorted({entry.task for entry in entries}, key=_task_order)
+    methods = sorted({entry.method for entry in entries}, key=_method_order)
+    return Results(Path(root), tuple(tasks), tuple(methods), {(e.task, e.method): e for e in entries}, tuple(waiting))
+
+
+def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
+    """Return runs as entries, sorted by dataset, algorithm and variant, and the runs that have no evaluation yet.
+
+    Raises:
+        OffbenchError: one is damaged, or there twice.
+    """
     groups: dict[tuple[str, str, str, str], list[Trained]] = {}
     waiting = []
-    for run in find_runs(Path(root)):
+    for run in runs:
         config, evaluations = run.config(), run.evaluations()
-        if not evaluations:
+        if evaluations:
+            key = (config["dataset"], config["dataset_sha256"], config["algorithm"], config["variant"])
+            groups.setdefault(key, []).append(Trained(run, config, evaluations))
+        else:
             waiting.append(run)
-            continue
-        key = (config["dataset"], config["dataset_sha256"], config["algorithm"], config["variant"])
-        groups.setdefault(tuple(map(str, key)), []).append(Trained(run, config, evaluations))  # type: ignore[arg-type]
-    if not groups:
-        raise OffbenchError(f"no evaluated runs below {root}; start one with `offbench train ALGO --dataset ID`")
     tasks = _tasks(groups)
-    entries = {}
-    for (dataset, content, algorithm, variant), runs in groups.items():
-        runs.sort(key=lambda trained: trained.seed)
-        _check_seeds(runs)
-        beta = runs[0].config["settings"].get("beta")
+    entries = []
+    for (dataset, content, algorithm, variant), group in groups.items():
+        group.sort(key=lambda trained: trained.seed)
+        _check_seeds(group)
+        beta = group[0].config["settings"].get("beta")
         beta = f"{beta:.2f}" if isinstance(beta, int | float) else beta
-        task, method = tasks[dataset, content], Method(algorithm, variant, beta)
-        entries[task, method] = Entry(task, method, tuple(runs))
-    methods = sorted({method for _, method in entries}, key=_method_order)
-    return Results(Path(root), tuple(sorted(tasks.values(), key=_task_order)), tuple(methods), entries, tuple(waiting))
+        entries.append(Entry(tasks[dataset, content], Method(algorithm, variant, beta), tuple(group)))
+    entries.sort(key=lambda e: (e.task.dataset, e.method.algorithm, e.method.variant, e.task.content))
+    return entries, waiting
 
 
 def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[Trained]]) -> dict[tuple[str, str], Task]:

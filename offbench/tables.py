@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,12 @@ import numpy as np
 from offbench.errors import OffbenchError
 from offbench.ladder import read_ladder
 from offbench.recipes import load_recipe
+from offbench.results import Entry, entries_of, read_results
 from offbench.runs import DIGITS, Run, find_runs
-from offbench.scores import LAST, mean_std, normalize, run_return
+from offbench.scores import normalize
 from offbench.statistics import iqm
 
 Row = dict[str, Any]
-Groups = dict[tuple[str, str, str, str], list[tuple[Run, dict[str, Any]]]]
 FORMATS = ("table", "json", "csv", "markdown", "latex")
 
 
@@ -35,12 +34,12 @@ def score_runs(runs: str | Path = "runs") -> list[Row]:
     Raises:
         OffbenchError: the folder holds no evaluated run, or a damaged one.
     """
-    return _rows(evaluated_groups(runs))
+    return _rows(read_results(runs).entries.values())
 
 
 def score_some(runs: Iterable[Run]) -> list[Row]:
     """Return the rows of `score_runs` for these runs alone; [] if none is evaluated."""
-    return _rows(_groups(runs))
+    return _rows(entries_of(runs)[0])
 
 
 def count_waiting(rows: Sequence[Row], runs: str | Path) -> int:
@@ -48,43 +47,29 @@ def count_waiting(rows: Sequence[Row], runs: str | Path) -> int:
     return len(find_runs(Path(runs))) - sum(int(row["seeds"]) for row in rows)
 
 
-def _rows(groups: Groups) -> list[Row]:
-    rows = [_row(*key[:3], group) for key, group in groups.items()]
-    if not ambiguous(groups):
-        return rows
-    return [
-        {"dataset": row["dataset"], "content": content[:DIGITS], **row}
-        for (*_, content), row in zip(groups, rows, strict=True)
-    ]
+def _rows(entries: Collection[Entry]) -> list[Row]:
+    twins = any(entry.task.twin for entry in entries)
+    return [_row(entry, twins) for entry in entries]
 
 
-def ambiguous(groups: Groups) -> set[str]:
-    """Return the dataset ids that stand for more than one content: a dataset was recorded again."""
-    known = Counter(dataset for dataset, _ in {(key[0], key[3]) for key in groups})
-    return {dataset for dataset, count in known.items() if count > 1}
-
-
-def _row(dataset: str, algorithm: str, variant: str, group: list[tuple[Run, dict[str, Any]]]) -> Row:
-    evaluations = [run.evaluations() for run, _ in group]
-    returns = [run_return(found) for found in evaluations]
-    reached = min(max(found) for found in evaluations)
+def _row(entry: Entry, twins: bool) -> Row:
+    mean_return, _ = entry.mean_std(None) or (None, None)
     row: Row = {
-        "dataset": dataset,
-        "algorithm": algorithm,
-        "variant": variant,
-        "seeds": len(group),
-        "steps": reached,
-        "of_steps": max(int(config["steps"]) for _, config in group),
-        "evaluations": min(min(len(found), LAST) for found in evaluations),
-        "return": float(np.mean(returns)),
+        "dataset": entry.task.dataset,
+        **({"content": entry.task.content[:DIGITS]} if twins else {}),
+        "algorithm": entry.method.algorithm,
+        "variant": entry.method.variant,
+        "seeds": len(entry.runs),
+        "steps": entry.reached,
+        "of_steps": entry.steps,
+        "evaluations": entry.evaluations,
+        "return": mean_return,
     }
     for column, reference in (("score", "dataset"), ("d4rl_score", "d4rl")):
-        pairs = [config["references"][reference] for _, config in group]
-        scores = [normalize(r, *pair) for r, pair in zip(returns, pairs, strict=True) if pair]
-        mean, std = mean_std(scores) if len(scores) == len(returns) else (None, None)
+        mean, std = entry.mean_std(reference) or (None, None)
         row |= {column: mean, f"{column}_std": std}
         if reference == "dataset":
-            middle = iqm({dataset: scores}) if mean is not None else None
+            middle = None if mean is None else iqm({"": [trained.score(reference) for trained in entry.runs]})
             ends = (middle.low, middle.high) if middle else (None, None)
             row |= {"iqm": middle.value if middle else None, "iqm_low": ends[0], "iqm_high": ends[1]}
     return row
@@ -115,28 +100,6 @@ def score_returns(env: str, returns: Sequence[float], behaviour_dir: str | Path 
         }
         for value in returns
     ]
-
-
-def evaluated_groups(runs: str | Path) -> Groups:
-    """Return the evaluated runs below a folder by (dataset, algorithm, variant, dataset content), sorted.
-
-    Raises:
-        OffbenchError: there are none, or one is damaged.
-    """
-    groups = _groups(find_runs(Path(runs)))
-    if not groups:
-        raise OffbenchError(f"no evaluated runs below {runs}; start one with `offbench train ALGO --dataset ID`")
-    return groups
-
-
-def _groups(runs: Iterable[Run]) -> Groups:
-    groups: Groups = {}
-    for run in runs:
-        config = run.config()
-        if run.evaluations():
-            key = (config["dataset"], config["algorithm"], config["variant"], config["dataset_sha256"])
-            groups.setdefault(key, []).append((run, config))
-    return dict(sorted(groups.items()))
 
 
 def normalize_runs_or_returns(

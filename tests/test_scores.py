@@ -189,3 +189,11 @@ def test_damaged_evaluations_are_said() -> None:
         path.write_text(text)
         with pytest.raises(offbench.OffbenchError, match="is damaged"):
             offbench.normalize("runs")
+
+
+def test_a_seed_that_is_there_twice_counts_for_nobody(capsys: pytest.CaptureFixture[str]) -> None:
+    write_run(0, [90.0], runs="runs/one")
+    write_run(0, [90.0], runs="runs/copy")
+    with pytest.raises(SystemExit):
+        main(["normalize"])
+    assert "are the same run twice" in capsys.readouterr().err
