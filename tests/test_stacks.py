@@ -135,7 +135,7 @@ def test_td3_bc_as_a_guest_in_a_stack_of_bdb_is_td3_bc(medium: str) -> None:
     finish([Job("bdb", (replace(td3_bc, seed=3),), replace(schedule, steps=100))])
     finish([Job("td3_bc", (replace(td3_bc, seed=3),), schedule)])
     alone = replace(orders(medium, "alone", 1, algorithm="td3_bc")[0], seed=3)
-    finish([Job("td3_bc", (alone,), schedule)])
+    finish(jobs_of([alone], schedule, 1))
     finish([Job("bdb", (replace(td3_bc, seed=3),), replace(schedule, steps=300))])  # and back again
     finish([Job("td3_bc", (alone,), replace(schedule, steps=300))])
     ours, theirs = (load_file(Path(o.folder) / "checkpoint-000000300.safetensors") for o in (td3_bc, alone))
