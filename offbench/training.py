@@ -177,9 +177,8 @@ class Trainer:
                 member.run.write_losses(self.losses[run])
                 self.stack.policy(run).save(member.run.policy_path)
                 state: dict[str, Any] = {"step": step}
-                if unlogged := self.stack.program.unlogged(
-                    run
-                ):  # stopped by the clock, between two rows of losses.csv
+                unlogged = self.stack.program.unlogged(run)
+                if unlogged:  # stopped by the clock, between two rows of losses.csv
                     state["unlogged"] = unlogged
                 checkpoints.save_checkpoint(folder, step, slice_of(tensors, run), state)
                 checkpoints.keep_newest(folder)
