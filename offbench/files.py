@@ -99,7 +99,9 @@ def write_json(path: Path, value: Any) -> None:
 def read_json(path: Path) -> Any:
     """Read a JSON file. Raises OffbenchError if it is missing or damaged."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(path.read_text(encoding="utf-8"))
+        json.dumps(found, ensure_ascii=False).encode()  # "\\ud800" is JSON, but no text that can be shown or written
+        return found
     except FileNotFoundError:
         raise OffbenchError(f"no file {path}") from None
     except (OSError, ValueError, RecursionError) as error:

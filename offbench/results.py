@@ -230,11 +230,16 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
     for (dataset, content, algorithm, variant), group in groups.items():
         group.sort(key=lambda trained: trained.seed)
         _check_seeds(group)
-        beta = group[0].config["settings"].get("beta")
-        beta = f"{beta:.2f}" if isinstance(beta, int | float) else beta
-        entries.append(Entry(tasks[dataset, content], Method(algorithm, variant, beta), tuple(group)))
+        method = Method(algorithm, variant, _beta(group[0].config["settings"].get("beta")))
+        entries.append(Entry(tasks[dataset, content], method, tuple(group)))
     entries.sort(key=lambda e: (e.task.dataset, e.method.algorithm, e.method.variant, e.task.content))
     return entries, waiting
+
+
+def _beta(value: Any) -> str | None:
+    if isinstance(value, int | float) and abs(value) < 1e6:
+        return f"{value:.2f}"
+    return None if value is None else str(value)  # what a damaged config.json or another's algorithm has there
 
 
 def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[Trained]]) -> dict[tuple[str, str], Task]:

@@ -295,13 +295,28 @@ def test_a_file_where_the_report_should_be(home: Path, capsys: pytest.CaptureFix
 
 @pytest.mark.parametrize(
     "damage",
-    [{"references": None}, {"references": {"dataset": [0, 0]}}, {"references": {"d4rl": ["a", "b"]}}, {"seed": "0"}],
+    [
+        {"references": None},
+        {"references": {"dataset": [0, 0]}},
+        {"references": {"d4rl": ["a", "b"]}},
+        {"seed": "0"},
+        {"dataset": "\ud800"},  # JSON has it, UTF-8 has not
+    ],
 )
 def test_a_damaged_config_is_said(home: Path, damage: dict[str, Any]) -> None:
     run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
     write_json(run.config_path, json.loads(run.config_path.read_text()) | damage)
     with pytest.raises(offbench.OffbenchError, match=r"config\.json is damaged"):
         offbench.report(home / "runs", home / "out")
+
+
+@pytest.mark.parametrize("beta", [[], {"a": 1}, 10**400, "$\\frac$"])
+def test_an_odd_beta_is_shown_as_it_is(home: Path, beta: object) -> None:
+    run = made_run(home / "runs", "hopper-medium-v0", "bdb", "odd=1", 0, 50)
+    write_json(run.config_path, json.loads(run.config_path.read_text()) | {"settings": {"beta": beta}})
+    (column,) = read_results(home / "runs").methods
+    assert column.label == f"bdb beta={beta},odd=1"
+    assert offbench.report(home / "runs", home / "out").exists()
 
 
 def test_losses_that_are_not_finite_are_drawn_as_gaps(home: Path) -> None:

@@ -1,7 +1,8 @@
 """Readers of files that others may have written: whatever is in them, an OffbenchError or an answer, and no pickle.
 
 Each case takes a sound file and spoils it: bits flipped, pieces cut, doubled or put in, JSON values and table cells
-replaced by odd ones. `CASES` of them for each reader in the slow run, a few in the fast one.
+replaced by odd ones. `CASES` of them for each reader in the slow run, a few in the fast one; the same ones every time, so
+that what fails is what a change has broken. `OFFBENCH_FUZZ=100000` looks for new ones, that many for each reader.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import csv
 import datetime
 import io
 import json
+import os
 import pickle
 import shutil
 import tempfile
@@ -39,7 +41,8 @@ from offbench.transitions import Transitions
 from tests.faults.spoil import WOUNDS, spoiled_json, spoiled_tensors, spoiled_words, wounded
 from tests.test_data_travels import d4rl_file
 
-CASES = 12_500  # of each of the readers below, in the slow run
+NEW = int(os.environ.get("OFFBENCH_FUZZ", "0"))
+CASES = NEW or 12_500  # of each of the readers below, in the slow run
 FEW = 40  # in the fast one
 QUICK = datetime.timedelta(seconds=20)  # a case that takes longer hangs
 LADDER = shipped() / "inverted-pendulum" / "behaviour"
@@ -266,7 +269,13 @@ def fuzz(name: str, folder: Path, cases: int) -> tuple[int, int]:
     read, spoiled = READERS[name]
     seen = [0, 0]
 
-    @settings(max_examples=cases, deadline=QUICK, database=None, suppress_health_check=list(HealthCheck))
+    @settings(
+        max_examples=cases,
+        deadline=QUICK,
+        database=None,
+        derandomize=not NEW,
+        suppress_health_check=list(HealthCheck),
+    )
     @given(spoiled)
     def case(data: bytes) -> None:
         seen[0] += 1
@@ -314,7 +323,7 @@ def test_a_bomb_inside_a_text_of_the_metadata(field: str, home: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
 def test_many_spoiled_files(name: str, home: Path, record_property: Callable[[str, object], None]) -> None:
-    assert CASES * (len(READERS) - len(SLOW_READERS)) >= 100_000
+    assert NEW or CASES * (len(READERS) - len(SLOW_READERS)) >= 100_000
     wanted = SLOW_READERS.get(name, CASES)
     cases, refused = fuzz(name, home, wanted)
     record_property("cases", cases)
