@@ -25,6 +25,7 @@ from offbench.ladder import read_ladder
 from offbench.policy import Policy, load_policy, uniform
 from offbench.recipes import shipped
 from offbench.runs import Run
+from tests import beside_d3rlpy
 
 DOC = (Path(__file__).parent.parent / "docs" / "interop.md").read_text()
 D3RLPY = "d3rlpy==2.8.1"
@@ -66,6 +67,16 @@ def test_every_block_of_the_page_runs(d3rlpy: str, home: Path) -> None:
     steps = [int(out.strip().splitlines()[-1].split()[0]) for place, out in ran if place == "d3rlpy"]
     assert steps == 2 * [len(mapped) - timeouts]
     assert dataset.provenance(dataset.read_metadata("back-v0"))["content_sha256"] == mapped.content
+
+
+@pytest.mark.slow
+def test_d3rlpys_weights_act_here_as_there(d3rlpy: str, medium: str, tmp_path: Path) -> None:
+    data = offbench.export(medium, tmp_path / "data.npz", style="npz")
+    words = [d3rlpy, beside_d3rlpy.__file__, str(data), "0", str(tmp_path), "20", "10"]
+    subprocess.run(words, check=True, capture_output=True)
+    assert [name for name in ("10", "20") if (tmp_path / f"{name}.npz").exists()] == ["10", "20"]
+    _, length = beside_d3rlpy.play(tmp_path / "20.npz", offbench.load(medium).env_id)
+    assert length >= 1
 
 
 def command_of(line: str) -> list[str]:

@@ -1,8 +1,8 @@
 """Readers of files that others may have written: whatever is in them, an OffbenchError or an answer, and no pickle.
 
 Each case takes a sound file and spoils it: bits flipped, pieces cut, doubled or put in, JSON values and table cells
-replaced by odd ones. `CASES` of them for each reader in the slow run, a few in the fast one; the same ones every time, so
-that what fails is what a change has broken. `OFFBENCH_FUZZ=100000` looks for new ones, that many for each reader.
+replaced by odd ones. `CASES` of them for each reader in the slow run, a few in the fast one; the same ones every time,
+so that what fails is what a change has broken. `OFFBENCH_FUZZ=100000` looks for new ones, that many for each reader.
 """
 
 from __future__ import annotations
