@@ -83,14 +83,15 @@ def benchmark(
     deadline = time.time() + _seconds(budget) if budget else None
     executor = executor or LocalExecutor(deadline)
     bench = prepare(grid) if isinstance(grid, str) else grid
-    for line in plan(bench):
+    costs: dict[str, float] = {}
+    for line in plan(bench, costs):
         say(line)
     executor.record(bench.missing(), bench.workers)
     if bench.missing():
         return False  # out of time
     parts = _parts(bench, shard)
     jobs = [
-        job
+        replace(job, cost=costs.get(job.kind, 1.0))
         for part, schedule in parts
         for job in pending(part, replace(schedule, deadline=deadline), tf32=bench.tf32, command=command)
     ]

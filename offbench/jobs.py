@@ -70,12 +70,17 @@ class Order:
 
 @dataclass(frozen=True)
 class Job:
-    """A stack that is to be trained."""
+    """A stack that is to be trained.
+
+    Attributes:
+        cost: of a run's update, beside those of the other jobs: for the time left.
+    """
 
     kind: str
     orders: tuple[Order, ...]
     schedule: Schedule
     tf32: bool = False
+    cost: float = 1.0
 
     @property
     def updates(self) -> int:
@@ -132,7 +137,9 @@ class Board(contextlib.AbstractContextManager["Board"]):
     def __init__(self, jobs: Sequence[Job]) -> None:
         self.jobs, self.steps = jobs, dict[int, int]()
         runs = sum(len(job.orders) for job in jobs)
-        self.progress = Progress(sum(job.updates for job in jobs), jobs[0].title if len(jobs) == 1 else f"{runs} runs")
+        title = jobs[0].title if len(jobs) == 1 else f"{runs} runs"
+        work = sum(job.updates * job.cost for job in jobs)
+        self.progress = Progress(sum(job.updates for job in jobs), title, work=work)
 
     def __exit__(self, *error: Any) -> None:
         self.progress.__exit__(*error)
@@ -146,9 +153,12 @@ class Board(contextlib.AbstractContextManager["Board"]):
     def at(self, job: int, step: int, note: str) -> None:
         """Take in that a job is at `step`."""
         if job not in self.steps:  # what was there before counts as done, not as speed
-            self.progress.skip(step * len(self.jobs[job].orders))
+            done = step * len(self.jobs[job].orders)
+            self.progress.skip(done, done * self.jobs[job].cost)
         self.steps[job] = step
-        self.progress.to(sum(step * len(self.jobs[i].orders) for i, step in self.steps.items()), note)
+        done_of = {i: step * len(self.jobs[i].orders) for i, step in self.steps.items()}
+        work = sum(done * self.jobs[i].cost for i, done in done_of.items())
+        self.progress.to(sum(done_of.values()), note, work)
 
 
 def _here(job: Job, place: int, board: Board) -> list[str]:

@@ -122,8 +122,12 @@ def _configs(entry: Entry) -> list[Any]:
     return configurations(kind.Config, entry.settings, entry.algorithm)
 
 
-def plan(bench: Benchmark) -> Iterator[str]:
-    """Yield what the grid is and what is left of it costs here, a line each; a finished grid costs no calibration."""
+def plan(bench: Benchmark, costs: dict[str, float] | None = None) -> Iterator[str]:
+    """Yield what the grid is and what is left of it costs here, a line each; a finished grid costs no calibration.
+
+    Args:
+        costs: takes the seconds of a run's update, evaluations included, of each algorithm that is measured.
+    """
     specs = {source.env: _recipe(source).env_spec() for source in bench.grid.datasets if source.env}
     specs = specs or {"": _known_spec(bench.grid.datasets[0])}
     spec = next(iter(specs.values()))  # for the shapes, which differ little
@@ -143,7 +147,10 @@ def plan(bench: Benchmark) -> Iterator[str]:
         if not orders:
             continue
         rate = measure(one.algorithm, one.config, spec, bench.device, tf32=bench.tf32)
-        cost = len(orders) * _cost(one.times, rate, play, spec) / bench.processes
+        each = _cost(one.times, rate, play, spec)
+        if costs is not None:
+            costs[one.algorithm] = each / one.times.steps
+        cost = len(orders) * each / bench.processes
         yield (
             f"  {one.name:<40}{len(orders):>4} runs x {one.times.steps:>9,} updates, "
             f"{rate.updates:>8,.0f} a second: {duration(cost)}"
