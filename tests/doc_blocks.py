@@ -38,6 +38,8 @@ REASONS = (
     "needs a GPU",
     "takes days",
     "takes an hour",
+    "takes an hour or two",
+    "needs d3rlpy's environment and the runs above",
     "needs a renderer",
     "needs D4RL's files",
     "another library's code",
