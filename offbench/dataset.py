@@ -215,6 +215,13 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
         yield path
 
 
+def tidy(dataset_id: str) -> None:
+    """Delete what a killed process left beside a dataset, unless one is at work on it or the folder is read-only."""
+    path = path_of(dataset_id)
+    with contextlib.suppress(OffbenchError), sole(_lock_path(path), dataset_id, patience=0), disk_errors(str(path)):
+        _recover(path)
+
+
 def write(
     path: Path,
     episodes: Iterable[Episode],
@@ -235,9 +242,8 @@ def write(
         expected: the content hash to come, where it is known; any other content is refused.
     """
     env_spec = EnvSpec.from_json(spec)
-    aside, old = path.with_name(f".offbench-{path.name}.partial"), _old(path)
+    aside = _partial(path)
     with disk_errors(str(path)):
-        shutil.rmtree(aside, ignore_errors=True)  # left by a process that was killed; the lock says none is at work
         (aside / "data").mkdir(parents=True)
         try:
             with warnings.catch_warnings():
@@ -254,11 +260,10 @@ def write(
             ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
             storage.update_metadata(metadata | {KEY: ours})
             if path.exists():
-                path.replace(old)
+                path.replace(_old(path))
             aside.replace(path)
         finally:
             _recover(path)
-            shutil.rmtree(aside, ignore_errors=True)
     return content.hexdigest()
 
 
@@ -267,14 +272,20 @@ def _old(path: Path) -> Path:
     return path.with_name(f".offbench-{path.name}.old")
 
 
+def _partial(path: Path) -> Path:
+    """Return where the dataset is written until it is whole."""
+    return path.with_name(f".offbench-{path.name}.partial")
+
+
 def _recover(path: Path) -> None:
-    """Put the replaced dataset back if the new one did not make it, else delete it."""
+    """Put the replaced dataset back if the new one did not make it, else delete it; delete what is half written."""
     old = _old(path)
     if old.exists() and not path.exists():
         old.replace(path)
     if old.is_symlink():
         old.unlink()  # never what it leads to
-    shutil.rmtree(old, ignore_errors=True)
+    for left in (old, _partial(path)):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def _buffers(episodes: Iterable[Episode], dtype: Any, content: ContentHash, file: SafeFile) -> Iterator[EpisodeBuffer]:

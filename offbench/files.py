@@ -33,12 +33,13 @@ def disk_errors(what: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def sole(lock: Path, what: str) -> Iterator[None]:
+def sole(lock: Path, what: str, patience: float = ORPHANS) -> Iterator[None]:
     """Hold a lock file for this process, so that no other does the same work.
 
     Args:
         lock: its path, a hidden name; beside it lies who holds it, for the other process to say.
         what: what is held and how, e.g. "hopper-medium-v0 is being recorded".
+        patience: seconds to wait for another process to let go.
 
     Raises:
         OffbenchError: another process holds it; its process id and host are named.
@@ -47,7 +48,7 @@ def sole(lock: Path, what: str) -> Iterator[None]:
     with disk_errors(str(lock.parent)):
         lock.parent.mkdir(parents=True, exist_ok=True)
         try:
-            held.acquire(timeout=ORPHANS)
+            held.acquire(timeout=patience)
         except Timeout:
             raise OffbenchError(f"{what} by {_holder(holder)}; wait for it, or stop it") from None
     try:

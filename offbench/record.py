@@ -84,6 +84,7 @@ def collect(
 
     ladder = _known_ladder(recipe, Path(behaviour_dir), retrain)
     if ladder and not overwrite and dataset.exists(dataset_id) and _is(dataset_id, prepared(ladder)[-1]):
+        dataset.tidy(dataset_id)
         print(f"offbench: {dataset_id} is recorded already, from the same policies and seed", file=sys.stderr)
         return dataset_id
     with dataset.claimed(dataset_id, overwrite) as path:

@@ -15,6 +15,7 @@ import pytest
 import offbench
 from offbench import dataset
 from offbench.errors import OffbenchError
+from offbench.files import sole
 from offbench.ladder import read_ladder
 from offbench.levels import LEVELS
 
@@ -198,6 +199,27 @@ def test_the_same_dataset_again_is_left_as_it_is(tiny: tuple[str, str], capsys: 
     for other in ({"steps": 60}, {"steps": 50, "seed": 1}):
         with pytest.raises(OffbenchError, match="exists already"):
             collect(**other)
+
+
+def test_what_a_killed_process_left_beside_a_dataset_goes_when_it_is_asked_for_again(tiny: tuple[str, str]) -> None:
+    """But never under the hands of a process that is at work on it."""
+
+    def collect() -> str:
+        return offbench.collect(tiny[0], "random", behaviour_dir=tiny[1], workers=1, steps=50)
+
+    def beside() -> set[str]:
+        return {p.name for p in dataset.root().iterdir() if not p.name.endswith(".lock")} - {name}
+
+    name = collect()
+    left = {f".offbench-{name}.{ending}" for ending in ("holder", "old", "partial")}
+    for folder in sorted(left)[1:]:
+        (dataset.root() / folder / "data").mkdir(parents=True)
+    with sole(dataset.root() / f".offbench-{name}.lock", "held"):
+        collect()
+        assert beside() == left
+    (dataset.root() / f".offbench-{name}.holder").touch()
+    collect()
+    assert beside() == set()
 
 
 @pytest.mark.parametrize("moment", ["before", "after"])
