@@ -17,7 +17,7 @@ import numpy as np
 from offbench.errors import OffbenchError
 from offbench.grid import Source, Times
 from offbench.jobs import Job, Order, complain, run_jobs
-from offbench.planning import Benchmark, plan, prepare
+from offbench.planning import Benchmark, Plan, prepare
 from offbench.record import record_source
 from offbench.stacking import Part, cut, diverged, pending, with_evaluators
 from offbench.training import Schedule
@@ -83,15 +83,15 @@ def benchmark(
     deadline = time.time() + _seconds(budget) if budget else None
     executor = executor or LocalExecutor(deadline)
     bench = prepare(grid) if isinstance(grid, str) else grid
-    costs: dict[str, float] = {}
-    for line in plan(bench, costs):
+    plan = Plan(bench)
+    for line in plan:
         say(line)
     executor.record(bench.missing(), bench.workers)
     if bench.missing():
         return False  # out of time
     parts = _parts(bench, shard)
     jobs = [
-        replace(job, cost=costs.get(job.kind, 1.0))
+        replace(job, cost=plan.update_seconds.get(job.kind, 1.0))
         for part, schedule in parts
         for job in pending(part, replace(schedule, deadline=deadline), tf32=bench.tf32, command=command)
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A grid at one place: what `plan` describes and `run` does."""
+    """A grid at one place: what `Plan` describes and `run` does."""
 
     grid: Grid
     variants: tuple[Variant, ...]
@@ -122,60 +122,76 @@ def _configs(entry: Entry) -> list[Any]:
     return configurations(kind.Config, entry.settings, entry.algorithm)
 
 
-def plan(bench: Benchmark, costs: dict[str, float] | None = None) -> Iterator[str]:
-    """Yield what the grid is and what is left of it costs here, a line each; a finished grid costs no calibration.
+class Plan:
+    """What a grid is and what is left of it costs here, told line by line; a finished grid costs no calibration.
 
-    Args:
-        costs: takes the seconds of a run's update, evaluations included, of each algorithm that is measured.
+    Attributes:
+        update_seconds: of each algorithm that was measured while the lines were told, what a run's update takes,
+            evaluations included.
     """
-    specs = {source.env: _recipe(source).env_spec() for source in bench.grid.datasets if source.env}
-    specs = specs or {"": _known_spec(bench.grid.datasets[0])}
-    spec = next(iter(specs.values()))  # for the shapes, which differ little
-    runs = {one: bench.orders(one) for one in bench.variants}
-    left = {
-        one: [order for order in orders if not finished(Run(Path(order.folder)), one.times.steps)]
-        for one, orders in runs.items()
-    }
-    sizes = {"dataset": len(bench.grid.datasets), "variant": len(runs), "run": sum(map(len, runs.values()))}
-    words = ", ".join(counted(size, noun) for noun, size in sizes.items())
-    yield f"{bench.grid.name}: {words}, {_count(left)} to train"
-    if not any(left.values()):
-        return
-    play = float(np.mean([step_seconds(spec) for spec in specs.values()]))
-    seconds, disk, products = 0.0, 0.0, 0.0
-    for one, orders in left.items():
-        if not orders:
-            continue
+
+    def __init__(self, bench: Benchmark) -> None:
+        self.bench = bench
+        self.update_seconds: dict[str, float] = {}
+        self._seconds = self._disk = self._products = 0.0  # of all that is left, summed up as it is told
+
+    def __iter__(self) -> Iterator[str]:
+        bench = self.bench
+        runs = {one: bench.orders(one) for one in bench.variants}
+        left = {
+            one: [order for order in orders if not finished(Run(Path(order.folder)), one.times.steps)]
+            for one, orders in runs.items()
+        }
+        sizes = {"dataset": len(bench.grid.datasets), "variant": len(runs), "run": sum(map(len, runs.values()))}
+        words = ", ".join(counted(size, noun) for noun, size in sizes.items())
+        yield f"{bench.grid.name}: {words}, {sum(map(len, left.values()))} to train"
+        if not any(left.values()):
+            return
+        specs = {source.env: _recipe(source).env_spec() for source in bench.grid.datasets if source.env}
+        specs = specs or {"": _known_spec(bench.grid.datasets[0])}
+        spec = next(iter(specs.values()))  # for the shapes, which differ little
+        play = float(np.mean([step_seconds(spec) for spec in specs.values()]))
+        self._seconds = self._disk = self._products = 0.0
+        for one, orders in left.items():
+            if orders:
+                yield self._variant(one, len(orders), spec, play)
+        if missing := bench.missing():
+            yield self._recording(missing, spec, play)
+        yield from self._total()
+
+    def _variant(self, one: Variant, runs: int, spec: str, play: float) -> str:
+        bench, times = self.bench, one.times
         rate = measure(one.algorithm, one.config, spec, bench.device, tf32=bench.tf32)
-        each = _cost(one.times, rate, play, spec)
-        if costs is not None:
-            costs[one.algorithm] = each / one.times.steps
-        cost = len(orders) * each / bench.processes
-        yield (
-            f"  {one.name:<40}{len(orders):>4} runs x {one.times.steps:>9,} updates, "
+        each = _cost(times, rate, play, spec)
+        self.update_seconds[one.algorithm] = each / times.steps
+        cost = runs * each / bench.processes
+        self._seconds += cost
+        self._disk += 2 * rate.bytes_per_run * runs
+        if bench.device == "cpu":
+            self._products += runs * times.steps * operations(one.algorithm, one.config, spec)
+        return (
+            f"  {one.name:<40}{runs:>4} runs x {times.steps:>9,} updates, "
             f"{rate.updates:>8,.0f} a second: {duration(cost)}"
         )
-        seconds += cost
-        disk += 2 * rate.bytes_per_run * len(orders)
-        if bench.device == "cpu":
-            products += len(orders) * one.times.steps * operations(one.algorithm, one.config, spec)
-    if missing := bench.missing():
+
+    def _recording(self, missing: Sequence[Source], spec: str, play: float) -> str:
         steps = sum(_size(source) for source in missing)
-        seconds += steps * play / bench.workers
-        disk += steps * _bytes_per_step(spec)
-        yield f"  to record first: {', '.join(source.id for source in missing)} ({steps:,} transitions)"
-    where = f"{bench.processes} processes of one thread" if bench.device == "cpu" else bench.device
-    yield f"  on {where} about {duration(seconds)}, {disk / 1e9:.1f} GB of disk (measured for a moment, just now)"
-    if bench.device == "cpu":
-        hours = duration(products / GPU_SPEED)
+        self._seconds += steps * play / self.bench.workers
+        self._disk += steps * _bytes_per_step(spec)
+        return f"  to record first: {', '.join(source.id for source in missing)} ({steps:,} transitions)"
+
+    def _total(self) -> Iterator[str]:
+        bench, cpu = self.bench, self.bench.device == "cpu"
+        where = f"{bench.processes} processes of one thread" if cpu else bench.device
         yield (
-            f"  on a GPU: not measured here; {products:.2g} operations in matrix products, which take {hours} "
-            f"if it does {GPU_SPEED / 1e12:.0f} Tflop/s of them"
+            f"  on {where} about {duration(self._seconds)}, {self._disk / 1e9:.1f} GB of disk "
+            "(measured for a moment, just now)"
         )
-
-
-def _count(left: Mapping[Variant, Sequence[Order]]) -> int:
-    return sum(map(len, left.values()))
+        if cpu:
+            yield (
+                f"  on a GPU: not measured here; {self._products:.2g} operations in matrix products, which take "
+                f"{duration(self._products / GPU_SPEED)} if it does {GPU_SPEED / 1e12:.0f} Tflop/s of them"
+            )
 
 
 def _cost(times: Times, rate: Rate, play: float, spec: str) -> float:

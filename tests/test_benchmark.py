@@ -22,7 +22,7 @@ from offbench.calibrate import operations
 from offbench.cli import main
 from offbench.errors import OffbenchError
 from offbench.grid import load_grid, shipped_grids
-from offbench.planning import plan, prepare
+from offbench.planning import Plan, prepare
 from offbench.recipes import load_recipe
 from offbench.registry import load_algorithm
 from offbench.runs import Run, find_runs
@@ -84,7 +84,7 @@ def test_the_papers_grid_is_its_table() -> None:
 @pytest.mark.parametrize("name", shipped_grids())
 def test_shipped_grids_are_sound_and_their_plan_counts_what_is_left(name: str) -> None:
     bench = prepare(name, workers=2)
-    first, *lines = plan(bench)
+    first, *lines = Plan(bench)
     runs = sum(len(bench.orders(one)) for one in bench.variants)
     datasets = len(bench.grid.datasets)
     words = "1 dataset" if datasets == 1 else f"{datasets} datasets"

@@ -107,7 +107,7 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
         from offbench.benchmarking import benchmark
 
         if plan:
-            print("\n".join(planning.plan(planning.prepare(**arguments))))
+            print("\n".join(planning.Plan(planning.prepare(**arguments))))
             return
         command = shlex.join(["offbench", "benchmark", *words])
         where = None
