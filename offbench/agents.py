@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from offbench.consistency import warn_other_references
 from offbench.errors import OffbenchError
-from offbench.ladder import Ladder
+from offbench.ladder import BEHAVIOUR, Ladder, folder_of
 from offbench.recipes import Recipe, load_recipe
 from offbench.sac import Training, train
 from offbench.selection import build_ladder, check_place
 from offbench.workers import default_workers
-
-
-def folder_of(recipe: Recipe, seed: int, behaviour_dir: Path) -> Path:
-    """Return where the training of a recipe and seed lives."""
-    return behaviour_dir / recipe.name / f"seed-{seed}"
 
 
 def behaviour(
@@ -23,7 +19,7 @@ def behaviour(
     seed: int = 0,
     steps: int | None = None,
     workers: int | None = None,
-    behaviour_dir: str | Path = "behaviour",
+    behaviour_dir: str | Path = BEHAVIOUR,
     out: str | Path | None = None,
 ) -> Ladder:
     """Train SAC on an environment, going on where an earlier call stopped, and build its ladder.
@@ -49,4 +45,6 @@ def behaviour(
     place = check_place(Path(out) if out else training.folder / "ladder")
     train(training, steps)
     command = f"offbench behaviour {recipe.name} --seed {seed} --steps {steps}"
-    return build_ladder(training, steps, place, default_workers(workers), command)
+    ladder = build_ladder(training, steps, place, default_workers(workers), command)
+    warn_other_references(recipe, ladder)
+    return ladder

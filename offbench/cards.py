@@ -22,7 +22,7 @@ from offbench import dataset
 from offbench.describe import Summary, show
 from offbench.errors import OffbenchError
 from offbench.files import read_json, write_bytes, write_json
-from offbench.ladder import Ladder, read_ladder
+from offbench.ladder import BEHAVIOUR, Ladder, find_ladder
 from offbench.levels import LEVELS
 from offbench.provenance import versions
 from offbench.recipes import Recipe, load_recipe
@@ -34,12 +34,13 @@ BINS = 50
 BLUE, RED = "#3b6ea5", "#c4443c"
 
 
-def card(env: str, out: str | Path | None = None) -> Path:
+def card(env: str, out: str | Path | None = None, behaviour_dir: str | Path = BEHAVIOUR) -> Path:
     """Write the card of an environment from its five recorded levels (seed 0, the recipe's size).
 
     Args:
         env: a shipped recipe's name, or a recipe file.
         out: the folder of the card; default `<env>-card`.
+        behaviour_dir: where agents trained here live, for an environment whose agent is not shipped.
 
     Returns:
         The folder.
@@ -48,9 +49,12 @@ def card(env: str, out: str | Path | None = None) -> Path:
         OffbenchError: a level is missing or was recorded otherwise, or there is no ladder.
     """
     recipe = load_recipe(env)
-    ladder = read_ladder(recipe.folder / "behaviour") if recipe.folder else None
+    ladder = find_ladder(recipe, Path(behaviour_dir))
     if ladder is None:
-        raise OffbenchError(f"{recipe.name} has no shipped ladder to describe; build one with `offbench behaviour`")
+        raise OffbenchError(
+            f"{recipe.name} has no ladder to describe, shipped or in {behaviour_dir}; "
+            f"build one with `offbench behaviour {env}`, or give its --behaviour-dir"
+        )
     levels = {level: _recorded(recipe, ladder, level) for level in LEVELS}
     facts = {level: _facts(recipe, summary) for level, summary in levels.items()}
     means = [facts[level]["return"] for level in LEVELS]
@@ -143,11 +147,14 @@ def _text(recipe: Recipe, ladder: Ladder, facts: Mapping[str, Any], made: Mappin
     )
     yield from ("", "## Behaviour agent", "")
     sac, where = info["sac"], info["hardware"]
+    links = f"every rung: `{ladder.folder}`"
+    if recipe.folder:
+        rungs = "[behaviour/ladder.csv](behaviour/ladder.csv)"
+        links = f"settings and why: [recipe.toml](recipe.toml); every rung: {rungs}"
     yield (
         f"Stable-Baselines3's SAC, seed {info['seed']}: {info['steps']:,} environment steps, "
         f"{sac['gradient_steps']:g} gradient steps for each, {info['hours']:.1f} hours on one core "
-        f"({where['processor']}). Command: `{info['command']}`; settings and why: [recipe.toml](recipe.toml); "
-        "every rung: [behaviour/ladder.csv](behaviour/ladder.csv)."
+        f"({where['processor']}). Command: `{info['command']}`; {links}."
     )
     yield from (
         "",

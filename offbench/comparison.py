@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from offbench.errors import OffbenchError, unknown
+from offbench.registry import algorithm_names
 from offbench.results import REFERENCES, Entry, Results, Task, Trained, read_results
 from offbench.statistics import Estimate, Paired, improvement, paired
 from offbench.wording import counted
@@ -127,8 +128,8 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
     """Compare two groups of runs over the datasets and seeds that both have.
 
     Args:
-        a, b: ALGO or ALGO/VARIANT, e.g. `td3_bc` and `bdb/beta=0.5`; an algorithm alone is its default variant,
-            or its only one.
+        a, b: ALGO or ALGO/VARIANT, e.g. `td3_bc` and `bdb/beta=0.5`, a variant as a run's folder or a table has
+            it; an algorithm alone is its default variant, or its only one.
         runs: the folder of the run directories.
 
     Raises:
@@ -200,8 +201,13 @@ def select(results: Results, selector: str) -> list[Entry]:
     algorithm, slash, variant = selector.partition("/")
     known = [method for method in results.methods if method.algorithm == algorithm]
     if not known:
-        raise unknown("algorithm", algorithm, {method.algorithm for method in results.methods})
+        here = {method.algorithm for method in results.methods}
+        if algorithm in algorithm_names():
+            raise OffbenchError(f"{algorithm} has no evaluated runs here; {', '.join(sorted(here))} have")
+        raise unknown("algorithm", algorithm, here)
     variants = {method.variant: method for method in known}
+    labels = {method.label.partition(" ")[2]: method.variant for method in known}  # as tables say it: beta=adaptive
+    variant = labels.get(variant, variant)
     if not slash:
         variant = next(iter(variants)) if len(variants) == 1 else "default"
         if variant not in variants:

@@ -59,6 +59,8 @@ def import_d4rl(file: str | Path, dataset_id: str, *, env: str | None = None, ov
     """
     path = Path(file)
     dataset.check_id(dataset_id)
+    if not path.is_file():
+        raise OffbenchError(f"no file {path}")
     try:
         with h5py.File(path, "r") as opened:
             source = read_source(path, opened)

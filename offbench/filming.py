@@ -25,7 +25,7 @@ from offbench import seeds
 from offbench.assess import open_policy
 from offbench.errors import OffbenchError
 from offbench.files import disk_errors, output_file, write_bytes
-from offbench.ladder import read_ladder
+from offbench.ladder import BEHAVIOUR, find_ladder
 from offbench.levels import SINGLE, parse_level
 from offbench.policy import Policy, uniform
 from offbench.recipes import load_recipe
@@ -102,9 +102,11 @@ def _who(path: str, env: str | None) -> tuple[Policy, str, bool]:
         return uniform(space.low, space.high, shape[0], recipe.env_id), spec, True  # type: ignore[attr-defined, index]
     if source == "replay" or level == "medium-expert":
         raise OffbenchError(f"{level} is not of one policy; film random, medium, expert or a fraction")
-    ladder = read_ladder(recipe.folder / "behaviour") if recipe.folder else None
+    ladder = find_ladder(recipe)
     if ladder is None:
-        raise OffbenchError(f"no ladder is shipped for {name}; give a policy file of your own training")
+        raise OffbenchError(
+            f"no ladder of {name} is shipped or in {BEHAVIOUR}/; give a policy file of your own training"
+        )
     rung = ladder.role(source) if source in ("medium", "expert") else ladder.nearest(float(source))
     return ladder.load(rung), spec, True
 

@@ -8,8 +8,10 @@ Returns are of the sampling policy, normalised between the uniform-random and th
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +22,11 @@ from offbench.environments import same_environment
 from offbench.errors import OffbenchError
 from offbench.files import read_json
 from offbench.policy import Policy, load_policy
+from offbench.provenance import warn_other_physics
 from offbench.recipes import Recipe, load_recipe, names
 from offbench.scores import normalize
 
+BEHAVIOUR = Path("behaviour")  # where trainings live unless the user says otherwise
 MEDIUM = 1 / 3  # of the expert's normalised return
 MEDIUM_AT_MOST = 0.45  # a rung beyond this is no medium while there is another
 POLICY_NAME = re.compile(r"\w[\w.-]*\.safetensors")  # a file of the ladder's own folder, nothing else
@@ -107,6 +111,8 @@ def read_ladder(folder: Path) -> Ladder | None:
             raise ValueError("its references are not numbers")
         if not ladder.random_return < ladder.expert_return or not isinstance(info["medium_replay"]["sha256"], str):
             raise ValueError("its references are out of order, or medium-replay has no hash")
+        if gone := [rung.policy for rung in rungs if not (folder / "policies" / rung.policy).is_file()]:
+            raise ValueError(f"it lacks policies/{gone[0]}")
         if not isinstance(info.get("versions", {}), dict):
             raise ValueError("its versions are no table")
     except (
@@ -123,6 +129,41 @@ def read_ladder(folder: Path) -> Ladder | None:
             f"the ladder in {folder} is damaged ({error!r}); delete it and build it again with `offbench behaviour`"
         ) from None
     return ladder
+
+
+def folder_of(recipe: Recipe, seed: int, behaviour_dir: Path) -> Path:
+    """Return where the training of a recipe and seed lives."""
+    return behaviour_dir / recipe.name / f"seed-{seed}"
+
+
+def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool = False) -> Ladder | None:
+    """Return the shipped ladder (unless `retrain`), else the one trained here, else None.
+
+    Raises:
+        OffbenchError: it is damaged, or of another environment.
+    """
+    shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder and not retrain else None
+    found = shipped or read_ladder(folder_of(recipe, 0, behaviour_dir) / "ladder")
+    if found is None:
+        return None
+    found.check(recipe)
+    if not shipped:
+        print(f"offbench: using the behaviour agent trained here: {found.folder}", file=sys.stderr)
+        _warn_other_recipe(found, recipe)
+    warn_other_physics(f"the behaviour agent of {recipe.name}", found.info.get("versions", {}))
+    return found
+
+
+def _warn_other_recipe(ladder: Ladder, recipe: Recipe) -> None:
+    """Say which settings of the recipe have been changed since the agent was trained."""
+    known, wanted = ladder.info.get("sac"), json.loads(json.dumps(dataclasses.asdict(recipe.sac)))
+    changed = [key for key, value in wanted.items() if isinstance(known, dict) and known.get(key, value) != value]
+    if changed:
+        print(
+            f"offbench: warning: that agent was trained with other [sac] settings than the recipe's "
+            f"({', '.join(changed)}); delete {ladder.folder.parent} to train it anew",
+            file=sys.stderr,
+        )
 
 
 def shipped_references(spec: str) -> tuple[float, float] | None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from offbench import dataset
 from offbench.calibrate import Rate, measure, operations, step_seconds
+from offbench.consistency import check_recorded
 from offbench.devices import pick_device
 from offbench.errors import OffbenchError
 from offbench.grid import Entry, Grid, Source, Times, load_grid
@@ -113,6 +114,8 @@ def prepare(
         raise OffbenchError(f"{read.name}: an algorithm with the same settings comes twice")
     if len({source.id for source in read.datasets}) < len(read.datasets):
         raise OffbenchError(f"{read.name}: a dataset comes twice")
+    for source in read.datasets:
+        check_recorded(source)
     place = pick_device(device)
     return Benchmark(read, tuple(variants), Path(runs), place, default_workers(workers), tf32, stack)
 

@@ -108,7 +108,7 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise OffbenchError(f"no recipe file {path}; write one like those in datasets/") from None
+        raise OffbenchError(f"no recipe file {path}; write one, or name a shipped one: {', '.join(names())}") from None
     except (OSError, ValueError, RecursionError) as error:  # not UTF-8, not TOML, a number of 5000 digits, a bomb
         raise OffbenchError(f"{where}: not a readable TOML file ({error})") from None
     values.setdefault("name", path.stem if folder is None else folder.name)
@@ -120,6 +120,12 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
     kwargs = values.pop("env_kwargs")
     recipe = dataclasses.replace(build(Recipe, values, where), env_kwargs=kwargs, folder=folder, **parts)
     _check(recipe, where)
+    shipped_one = load_recipe(recipe.name) if folder is None and recipe.name in names() else recipe
+    if recipe.env_id != shipped_one.env_id:
+        raise OffbenchError(
+            f"{where}: {recipe.name} is a shipped environment, {shipped_one.env_id}, and its datasets would have the "
+            "same ids; give the recipe another name (its file's, or `name = ...`)"
+        )
     return recipe
 
 

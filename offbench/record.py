@@ -14,15 +14,16 @@ import numpy as np
 
 from offbench import dataset
 from offbench.cards import compare
+from offbench.consistency import warn_other_references
 from offbench.environments import make_env
 from offbench.errors import OffbenchError
 from offbench.files import sha256
 from offbench.grid import Source
-from offbench.ladder import MEDIUM, MEDIUM_AT_MOST, Ladder, Rung, read_ladder
+from offbench.ladder import BEHAVIOUR, MEDIUM, MEDIUM_AT_MOST, Ladder, Rung, find_ladder
 from offbench.levels import Part, parse_level, parse_mix, shares
 from offbench.policy import Policy, uniform
 from offbench.progress import Progress, duration
-from offbench.provenance import versions, warn_other_physics
+from offbench.provenance import versions
 from offbench.recipes import Recipe, load_recipe
 from offbench.replay import load_replay
 from offbench.rollout import Episode, Rollouts
@@ -46,7 +47,7 @@ def collect(
     dataset_id: str | None = None,
     overwrite: bool = False,
     retrain: bool = False,
-    behaviour_dir: str = "behaviour",
+    behaviour_dir: str | Path = BEHAVIOUR,
 ) -> str:
     """Record one level of one environment as a local Minari dataset.
 
@@ -82,13 +83,14 @@ def collect(
         counts = _counts(recipe, ladder, parts, steps)
         return recording, sources, counts, _metadata(recording, dataset_id, mix or level, parts, sources, counts)
 
-    ladder = _known_ladder(recipe, Path(behaviour_dir), retrain)
+    ladder = find_ladder(recipe, Path(behaviour_dir), retrain)
     if ladder and not overwrite and dataset.exists(dataset_id) and _is(dataset_id, prepared(ladder)[-1]):
         dataset.tidy(dataset_id)
         print(f"offbench: {dataset_id} is recorded already, from the same policies and seed", file=sys.stderr)
         return dataset_id
     with dataset.claimed(dataset_id, overwrite) as path:
-        recording, sources, counts, metadata = prepared(ladder or _train(recipe, Path(behaviour_dir), workers))
+        ladder = ladder or _train(recipe, Path(behaviour_dir), workers)
+        recording, sources, counts, metadata = prepared(ladder)
         total = sum(counts)
         with Progress(total, f"recording {dataset_id}") as progress:
             streams = (recording.episodes(*item) for item in zip(parts, sources, counts, itertools.count()))
@@ -96,6 +98,7 @@ def collect(
             content = dataset.write(path, episodes, recording.spec, metadata, total)
     if seed == 0 and steps is None and not retrain and (said := compare(recipe, name, content)):
         print(f"offbench: {said}", file=sys.stderr)
+    warn_other_references(recipe, ladder)
     return dataset_id
 
 
@@ -130,23 +133,6 @@ def _is(dataset_id: str, wanted: Mapping[str, Any]) -> bool:
     return all(known.get(key) == ours[key] for key in WHAT_IT_IS) and made[0] == made[1]
 
 
-def _known_ladder(recipe: Recipe, behaviour_dir: Path, retrain: bool) -> Ladder | None:
-    """Return the shipped ladder, else the one trained here, else None."""
-    shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder and not retrain else None
-    if shipped:
-        shipped.check(recipe)
-        warn_other_physics(f"the behaviour agent of {recipe.name}", shipped.info.get("versions", {}))
-        return shipped
-    from offbench.agents import folder_of  # imports PyTorch
-
-    local = read_ladder(folder_of(recipe, 0, behaviour_dir) / "ladder")
-    if local is None:
-        return None
-    print(f"offbench: using the behaviour agent trained here: {local.folder}", file=sys.stderr)
-    warn_other_physics(f"the behaviour agent of {recipe.name}", local.info.get("versions", {}))
-    return local.check(recipe)
-
-
 def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:
     """Train the recipe's behaviour agent now."""
     from offbench.agents import behaviour
@@ -154,8 +140,8 @@ def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:
     recipe.env_spec()  # refuses a bad environment before an hour is announced
     gradient, steps = recipe.sac.steps * recipe.sac.gradient_steps, recipe.sac.steps
     print(
-        f"offbench: {recipe.name} has no behaviour agent yet; training SAC for {steps:,} steps first, "
-        f"roughly {duration(gradient / 65 + steps / 4000)} on one core (it resumes if stopped)",
+        f"offbench: {recipe.name} has no behaviour agent in {behaviour_dir} yet; training SAC for {steps:,} steps "
+        f"first, roughly {duration(gradient / 65 + steps / 4000)} on one core (it resumes if stopped)",
         file=sys.stderr,
     )
     return behaviour(recipe, behaviour_dir=behaviour_dir, workers=workers)

@@ -57,6 +57,10 @@ class Run:
 
     def config(self) -> dict[str, Any]:
         """Read config.json. Raises OffbenchError if it is missing or damaged."""
+        if not self.config_path.exists():
+            raise OffbenchError(
+                f"no run in {self.folder} (no config.json); a run is RUNS/DATASET/ALGORITHM/VARIANT/seed-N"
+            )
         config = read_json(self.config_path)
         for key, kind in REQUIRED.items():
             if not isinstance(config, dict) or not _is(config.get(key), kind):
@@ -82,6 +86,11 @@ class Run:
         if self.config_path.exists():
             known = self.config()
             for key in MUST_MATCH:
+                if known.get(key) != config[key] and key == "dataset_sha256":
+                    raise OffbenchError(
+                        f"{self.folder} was trained on another content of {config['dataset']}, which has been "
+                        "recorded again since; delete that run or give another --runs"
+                    )
                 if known.get(key) != config[key]:
                     raise OffbenchError(
                         f"{self.folder} holds a run with {key} {known.get(key)!r}, not {config[key]!r}; "
@@ -127,6 +136,8 @@ class Run:
                 if tuple(reader.fieldnames or ()) != EVALUATION_COLUMNS:
                     raise ValueError(f"its columns are {reader.fieldnames}")
                 for row in reader:
+                    if None in row.values():
+                        raise ValueError("a row is cut short")
                     value = float(row["return"])
                     if not math.isfinite(value):
                         raise ValueError(f"a return is {value}")

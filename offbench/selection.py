@@ -112,7 +112,9 @@ def check_place(out: Path) -> Path:
     if out.exists() and not out.is_dir():
         raise OffbenchError(f"{out} is a file; a ladder needs a folder of its own")
     if out.exists() and any(out.iterdir()) and not (out / "ladder.json").exists():
-        raise OffbenchError(f"{out} holds other files, which a ladder would replace; give an empty or new folder")
+        raise OffbenchError(
+            f"{out} holds other files, which a ladder would replace; delete it, or give an empty or new folder"
+        )
     return out
 
 

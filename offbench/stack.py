@@ -16,6 +16,7 @@ from torch import Tensor
 from offbench.algorithm import Algorithm, PolicyParts, check_logs, stack_configs
 from offbench.batches import CHUNK, Member, Store, draw_chunk
 from offbench.errors import OffbenchError
+from offbench.networks import Learned, Target
 from offbench.policy import Policy, check_networks
 
 Sums = list[tuple[str, float, int]]  # of each logged quantity: its name, its sum, and over how many updates
@@ -78,8 +79,11 @@ class Program:
         batch = self.store.batch(self.indices.index_select(0, self.position)[0])
         noise = {name: values.index_select(0, self.position)[0] for name, values in self.noise.items()}
         logs = self.algorithm.update(batch, noise, kind)
+        where = f"{type(self.algorithm).__name__}.update"
         if kind not in self._names:
-            check_logs(logs, len(self.store.sizes), f"{type(self.algorithm).__name__}.update")
+            check_logs(logs, len(self.store.sizes), where)
+        elif self._names[kind] != list(logs):  # a captured graph would go on with those of the first update
+            raise OffbenchError(f"{where} must log the same names at every update of kind {kind!r}")
         for name, value in logs.items():
             if name not in self.sums:
                 self.sums[name] = torch.zeros_like(value)
@@ -119,6 +123,7 @@ class Stack:
         observation_dim, action_dim = dims.pop()
         self.algorithm = kind(config, observation_dim, action_dim, self.seeds, self.device)
         _check_policy(self.algorithm, observation_dim, action_dim)
+        _check_learned(self.algorithm)
         self.batch_size: int = config.batch_size
         self.store = Store(members, config.normalize, self.device)
         self.program = Program(self.algorithm, self.store)
@@ -198,6 +203,16 @@ class Stack:
                 bad = (~torch.isfinite(tensor)).flatten(2).any(2).any(0).nonzero()
                 found |= {int(run): name for run in bad}
         return found
+
+
+def _check_learned(algorithm: Algorithm) -> None:
+    """Raise OffbenchError if a checkpoint would lack a network: a run that resumes would go on with another one."""
+    where, kept = f"{type(algorithm).__name__}.learned", list(algorithm.learned.values())
+    if not kept:
+        raise OffbenchError(f"{where} is empty: a checkpoint would keep nothing")
+    for name, part in vars(algorithm).items():
+        if isinstance(part, Learned | Target) and not any(part is one for one in kept):
+            raise OffbenchError(f"{where} lacks {name}: a run that resumes would go on with another one")
 
 
 def _check_policy(algorithm: Algorithm, observation_dim: int, action_dim: int) -> None:

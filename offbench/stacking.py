@@ -101,11 +101,34 @@ def pending(part: Part, schedule: Schedule, *, tf32: bool = False, command: str 
         OffbenchError: another run lives in a run's directory, or one is further than the schedule goes.
     """
     for order, member in zip(part.orders, part.members, strict=True):
+        check_whole(member.run, schedule, evaluates=bool(member.data.env_spec))
         member.run.claim(_config(order, member, schedule, tf32, command))
     order_of = {member.run.folder: order for order, member in zip(part.orders, part.members, strict=True)}
     left = [member for member in part.members if not member.run.diverged]
     stages = together(left, schedule.steps)
     return [Job(part.kind, tuple(order_of[m.run.folder] for m in stage), schedule, tf32) for stage in stages]
+
+
+def check_whole(run: Run, schedule: Schedule, evaluates: bool) -> None:
+    """Refuse a run that lacks what was written before its newest checkpoint: going on would give another score.
+
+    Raises:
+        OffbenchError: its config.json is gone, or an evaluation (unless it `evaluates` never).
+    """
+    newest = max(checkpoints.steps(run.folder), default=0)
+    if not newest:
+        return
+    if not run.config_path.exists():
+        raise OffbenchError(f"{run.folder} holds a run without its config.json; put it back, or delete the run")
+    known, every = run.evaluations(), schedule.eval_every
+    if run.config().get("eval_every") != every or not evaluates:
+        return  # claim says so, or there is nothing to lack
+    for step in range(every, newest, every):
+        if step not in known:
+            raise OffbenchError(
+                f"{run.evaluations_path} lacks the evaluation of step {step}; put the file back, or delete the run "
+                "to repeat it"
+            )
 
 
 def diverged(parts: Sequence[Part]) -> list[str]:
@@ -127,8 +150,8 @@ def with_evaluators(jobs: Sequence[Job], workers: int) -> list[Job]:
 
 
 def finished(run: Run, steps: int) -> bool:
-    """Return whether a run has come to its end: a checkpoint at step `steps`, and an evaluation unless it has none."""
-    if steps not in checkpoints.steps(run.folder) or not run.config_path.exists():
+    """Return whether a run has come to its end: checkpoint and evaluation of step `steps`, and a policy."""
+    if steps not in checkpoints.steps(run.folder) or not run.config_path.exists() or not run.policy_path.exists():
         return False
     return not run.config().get("env_spec") or steps in run.evaluations()
 

@@ -160,6 +160,8 @@ class Trainer:
                 self.stack.step = step
                 break
         for run, member in enumerate(self.members):
+            if self.stack.step and not member.run.policy_path.exists():  # somebody deleted it: the checkpoint has it
+                self.stack.policy(run).save(member.run.policy_path)
             known, rows = member.run.evaluations(), member.run.losses()
             # an evaluation at the end of a shorter schedule may lie off this one's grid
             self.evaluations[run] = {s: e for s, e in known.items() if s <= self.stack.step and self._evaluates_at(s)}

@@ -14,6 +14,7 @@ from typing import Any
 
 from offbench.errors import OffbenchError
 
+STOPS = {signal.SIGINT, signal.SIGTERM}
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -35,12 +36,12 @@ def default_workers(workers: int | None) -> int:
 def quiet_start() -> Iterator[None]:
     """Let a worker start undisturbed: submitting a task may start one.
 
-    Ctrl-C is held back meanwhile (half a start would leave the pool unusable), and the user's script is hidden: a
-    spawned process would run it again, and a worker needs nothing of it. A worker gets one thread for its matrix
-    products: as many threads as cores in each of as many workers made recording several times slower.
+    Ctrl-C and SIGTERM are held back meanwhile (half a start would leave the pool unusable), and the user's script
+    is hidden: a spawned process would run it again, and a worker needs nothing of it. A worker gets one thread for
+    its matrix products: as many threads as cores in each of as many workers made recording several times slower.
     """
     masks = hasattr(signal, "pthread_sigmask")
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS) if masks else set()
     script = sys.modules["__main__"]
     sys.modules["__main__"] = types.ModuleType("__main__")
     threads = {name: "1" for name in THREADS if name not in os.environ}
@@ -68,6 +69,8 @@ def start_worker(parent: int, closing: Any = None) -> None:
         closing: an event: nothing that this worker is at is wanted any more.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)  # held back while it started
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
     _Here.closing = closing
 

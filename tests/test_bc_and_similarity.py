@@ -84,5 +84,5 @@ def test_similarity_needs_a_critic_and_its_dataset(tiny: tuple[str, str], medium
     offbench.collect(tiny[0], "medium", behaviour_dir=tiny[1], workers=1, seed=4, overwrite=True)
     with pytest.raises(OffbenchError, match="no longer the dataset"):
         similarity(run)
-    with pytest.raises(OffbenchError, match="no file"):
+    with pytest.raises(OffbenchError, match="no run in nowhere"):
         similarity(Path("nowhere"))

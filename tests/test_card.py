@@ -99,5 +99,15 @@ def test_another_content_is_said_with_the_likely_reason(home: Path) -> None:
 
 
 def test_an_environment_without_a_ladder_has_no_card() -> None:
-    with pytest.raises(OffbenchError, match="ant has no shipped ladder"):
+    with pytest.raises(OffbenchError, match="ant has no ladder to describe, shipped or in behaviour"):
         card("ant")
+
+
+def test_an_environment_of_ones_own_has_a_card_too(tiny: tuple[str, str], home: Path) -> None:
+    recipe, behaviour_dir = tiny
+    for level in LEVELS:
+        offbench.collect(recipe, level, behaviour_dir=behaviour_dir, workers=1)
+    text = (card(recipe, home / "card", behaviour_dir) / "README.md").read_text()
+    levels = read_json(home / "card" / "card.json")["levels"]
+    assert f"| medium | {levels['medium']['transitions']:,} |" in text
+    assert f"every rung: `{behaviour_dir}/tiny/seed-0/ladder`." in text

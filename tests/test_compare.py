@@ -9,6 +9,8 @@ import pytest
 
 import offbench
 from offbench.cli import main
+from offbench.comparison import compare
+from offbench.errors import OffbenchError
 from tests.made_runs import made_run
 
 
@@ -95,6 +97,17 @@ def test_an_algorithm_alone_is_its_default_or_only_variant(home: Path) -> None:
     scores(home / "runs", "bdb", [1.0], variant="beta=0.5")
     scores(home / "runs", "bdb", [2.0])
     assert (offbench.compare("cql", "bdb").a, offbench.compare("cql", "bdb").b) == ("cql alpha=1", "bdb")
+
+
+def test_a_variant_may_be_named_as_tables_name_it(home: Path) -> None:
+    """The adaptive beta is BDB's default: a folder says `default`, a table `beta=adaptive`."""
+    scores(home / "runs", "td3_bc", [1.0])
+    for seed, value in enumerate([2.0, 3.0]):
+        run = made_run(home / "runs", "hopper-medium-v0", "bdb", "default", seed, 0, settings={"beta": "adaptive"})
+        run.write_evaluations({30_000: [(value, 5)]})
+    assert compare("bdb/beta=adaptive", "td3_bc", runs="runs").a == "bdb beta=adaptive"
+    with pytest.raises(OffbenchError, match=r"cql has no evaluated runs here; bdb, td3_bc have"):
+        compare("cql", "td3_bc", runs="runs")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import socket
@@ -201,8 +202,30 @@ def test_another_run_in_the_same_place_is_refused(tiny: tuple[str, str], medium:
         train("td3_bc", medium, "runs", 200, eval_episodes=3)
     recipe, behaviour_dir = tiny
     offbench.collect(recipe, "medium", behaviour_dir=behaviour_dir, workers=1, seed=1, overwrite=True)
-    with pytest.raises(OffbenchError, match="dataset_sha256"):
+    with pytest.raises(OffbenchError, match="trained on another content of"):
         train("td3_bc", medium, "runs", 200)
+
+
+def test_a_run_whose_files_were_deleted_is_not_taken_for_another(medium: str) -> None:
+    """Going on from half of its evaluations, or under a new config.json, would give numbers that are not the run's."""
+    (run,) = train("td3_bc", medium, "runs", 300)
+    for path, steps in itertools.product((run.config_path, run.evaluations_path), (300, 400)):
+        kept = path.read_bytes()
+        path.unlink()
+        with pytest.raises(OffbenchError, match=f"{path.name}.*put (it|the file) back, or delete the run"):
+            train("td3_bc", medium, "runs", steps)
+        path.write_bytes(kept)
+    run.write_evaluations({step: found for step, found in run.evaluations().items() if step != 200})
+    with pytest.raises(OffbenchError, match="lacks the evaluation of step 200"):
+        train("td3_bc", medium, "runs", 400)
+
+
+def test_a_deleted_policy_comes_back_from_the_checkpoint(medium: str) -> None:
+    (run,) = train("td3_bc", medium, "runs", 300)
+    policy, evaluations = run.policy_path.read_bytes(), run.evaluations_path.read_bytes()
+    run.policy_path.unlink()
+    train("td3_bc", medium, "runs", 300)
+    assert (run.policy_path.read_bytes(), run.evaluations_path.read_bytes()) == (policy, evaluations)
 
 
 def test_what_trained_a_run_later_is_noted_if_it_is_something_else(
@@ -268,7 +291,8 @@ def test_training_survives_kill_9(medium: str, home: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_leaves_a_run_that_resumes(medium: str, home: Path) -> None:
+@pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_ctrl_c_and_sigterm_leave_a_run_that_resumes(medium: str, home: Path, sent: int, status: int) -> None:
     words = [
         "train",
         "td3_bc",
@@ -287,9 +311,10 @@ def test_ctrl_c_leaves_a_run_that_resumes(medium: str, home: Path) -> None:
     deadline = time.monotonic() + 60
     while not checkpoints.steps(folder) and time.monotonic() < deadline:
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(sent)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == status
+    assert "leaked" not in errors
     assert "the same command goes on" in errors
     assert "Traceback" not in errors
     assert checkpoints.steps(folder)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NoReturn
 
 from offbench.cli import aids, data, results, training, travel
 from offbench.cli.arguments import Parser
@@ -47,21 +50,45 @@ RESUMED = ("collect", "train", "benchmark", "behaviour")  # that keep checkpoint
 def main(argv: Sequence[str] | None = None) -> None:
     """Run one command.
 
-    Exits with 0, 1 if `verify` or `doctor` found something, 2 for a problem the user can mend, 130 after Ctrl-C.
+    Exits with 0, 1 if `verify` or `doctor` found something, 2 for a problem the user can mend, 130 after Ctrl-C, 143
+    after SIGTERM.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        _run(words)
+        with _terminable():
+            _run(words)
     except OffbenchError as error:
         print(f"offbench: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         goes_on = "; the same command goes on from the last checkpoint, or begins again if there is none yet"
         print(f"\noffbench: stopped{goes_on if _command(words) in RESUMED else ''}", file=sys.stderr)
-        sys.exit(130)
+        sys.exit(143 if isinstance(stop, Terminated) else 130)
     except BrokenPipeError:  # the reader of a pipe (`| head`) has left
         sys.stderr.close()
         sys.exit(0)
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM came: from Slurm at its time limit, from a container that is stopped."""
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM end a command as Ctrl-C does: with what it has started ended too, and a line that says so."""
+
+    def stop(*_: object) -> NoReturn:
+        raise Terminated
+
+    try:
+        before = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # only the main thread may
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _run(words: list[str]) -> None:

@@ -86,8 +86,9 @@ def show_arguments(parser: Parser, _: list[str]) -> None:
 
 def card_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `card`."""
-    parser.add_argument("env", metavar="ENV", help="a recipe with a ladder in the folder `behaviour` beside it")
+    parser.add_argument("env", metavar="ENV", help="a shipped recipe or a recipe file, its five levels recorded")
     parser.add_argument("--out", metavar="DIR", help="where the card goes (default: <env>-card)")
+    _behaviour_dir(parser)
 
     def run(**arguments: Any) -> None:
         from offbench.cards import card

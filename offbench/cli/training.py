@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import shlex
 import sys
 from typing import Any
@@ -48,7 +49,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
             nargs="+" if several else None,
             metavar="N,N" if isinstance(field.default, tuple) else "X",
             default=argparse.SUPPRESS,
-            help=f"{field.metadata.get('help', '')} (default: {_default(field.default)})".replace("%", "%%"),
+            help=_help(field).replace("%", "%%"),
         )
 
     def run(**arguments: Any) -> None:
@@ -126,5 +127,8 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
-def _default(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+def _help(field: dataclasses.Field[Any]) -> str:
+    """Return a setting's help, with the words that it may be and its default."""
+    words = " | ".join(field.metadata.get("choices") or ())
+    default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else str(field.default)
+    return f"{field.metadata.get('help', '')} ({words}{'; ' if words else ''}default: {default})"
