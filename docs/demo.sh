@@ -18,3 +18,4 @@ train="--dataset hopper-medium-v0 --runs demo/runs --eval-episodes 5"
 
 echo "== scores"
 "$BIN/offbench" normalize --runs demo/runs --plot demo/curves.png
+echo "the same as a page: $BIN/offbench report --runs demo/runs"

@@ -4,7 +4,7 @@ datasets = ["hopper-medium-v0", {id = "mine-v0", env = "./my-env.toml", level = 
 seeds = 5                          # that many, or a list
 steps = 1_000_000                  # with eval_every and eval_episodes as in `offbench train`
 [[algorithms]]
-name = "bdb"                       # then its settings; a list for those that may differ between runs
+name = "bdb"                       # then its settings; a list is a variant for each value (hidden: a list of lists)
 beta = [0.25, "adaptive"]
 steps = 500_000                    # seeds, steps, eval_every and eval_episodes of its own, if need be
 """

@@ -59,8 +59,8 @@ def train(
         tensorboard: write TensorBoard event files into each run's folder `tensorboard`.
         wandb: a Weights & Biases project to show the runs in.
         command: what the user typed, for the run's config.json.
-        settings: the algorithm's own (`offbench train bdb --help`); a setting that may differ between the runs
-            of a stack also takes a list, e.g. `beta=[0.25, 0.5, "adaptive"]`.
+        settings: the algorithm's own (`offbench train bdb --help`); each also takes a list of values, e.g.
+            `beta=[0.25, 0.5, "adaptive"]`, or `hidden=[(64, 64), (256, 256)]`.
 
     Returns:
         The runs' directories: datasets x settings x seeds.
@@ -122,12 +122,18 @@ def configurations(cls: type, settings: Mapping[str, Any], algorithm: str) -> li
     for name, value in settings.items():
         if name not in known:
             raise unknown(f"setting of {algorithm}", name, known)
-        several = isinstance(value, list | tuple) and known[name].metadata.get("per_run")
-        values = list(value) if several else [value]
+        values = list(value) if _several(value, known[name].default) else [value]
         if not values:
             raise OffbenchError(f"{algorithm}: {name} got an empty list")
         columns.append([(name, check(cls, name, item, algorithm)) for item in values])
     return list(dict.fromkeys(cls(**dict(row)) for row in itertools.product(*columns)))
+
+
+def _several(value: Any, default: Any) -> bool:
+    """Return whether a list holds values of a setting, rather than being one, as (64, 64) is of `hidden`."""
+    if not isinstance(value, list | tuple):
+        return False
+    return not isinstance(default, tuple) or any(isinstance(item, list | tuple) for item in value)
 
 
 def _check_numbers(seeds: Sequence[int], steps: int, eval_every: int, eval_episodes: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import random
 import shutil
@@ -316,3 +317,22 @@ def test_a_run_that_diverged_before_is_said_and_left_alone(grid: str, home: Path
     assert (
         said[-1] == f"{run.folder.relative_to(home)} has diverged before and is left as it is; delete it to try again"
     )
+
+
+def test_a_list_is_a_variant_for_each_value_of_any_setting(tmp_path: Path) -> None:
+    """Also of settings that runs of one stack cannot differ in; a list that is one value stays one."""
+    grid = tmp_path / "grid.toml"
+    settings = (
+        'beta = [0.5, "adaptive"]\nbatch_size = [16, 32]\nhidden = [[8, 8], [16]]\ndiscriminator_hidden = [4, 4]'
+    )
+    grid.write_text(f'datasets = ["hopper-medium-v0"]\n[[algorithms]]\nname = "bdb"\n{settings}')
+    found = {(v.config.beta, v.config.batch_size, v.config.hidden) for v in prepare(str(grid)).variants}
+    assert found == set(itertools.product((0.5, "adaptive"), (16, 32), ((8, 8), (16,))))
+    assert {v.config.discriminator_hidden for v in prepare(str(grid)).variants} == {(4, 4)}
+
+
+def test_values_that_make_separate_stacks_train_in_one_command(medium: str) -> None:
+    sizes = {"steps": 20, "eval_every": 20, "eval_episodes": 1, "hidden": (8,), "workers": 1}
+    folders = offbench.train("td3_bc", medium, batch_size=[8, 16], **sizes)
+    assert [folder.parent.name for folder in folders] == ["batch_size=8,hidden=8", "batch_size=16,hidden=8"]
+    assert all((folder / "policy.safetensors").exists() for folder in folders)

@@ -42,11 +42,10 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     parser.asked = f"offbench train {algorithm}"
     group = parser.add_argument_group(f"settings of {algorithm}")
     for name, field in known.items():
-        several = bool(field.metadata.get("per_run"))
         group.add_argument(
             f"--{name.replace('_', '-')}",
             dest=f"setting_{name}",
-            nargs="+" if several else None,
+            nargs=None if isinstance(field.default, tuple) else "+",
             metavar="N,N" if isinstance(field.default, tuple) else "X",
             default=argparse.SUPPRESS,
             help=_help(field).replace("%", "%%"),

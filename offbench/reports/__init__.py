@@ -107,8 +107,8 @@ def _figures(results: Results) -> dict[str, list[Figure]]:
     aggregates = tables.iqms(results)
     if aggregates:
         groups["iqm"] = [draw.iqm_figure(aggregates, looks), draw.profile_figure(aggregates, looks)]
-    if len(results.tasks) > 1 and aggregates:
-        groups["curves"].append(draw.iqm_curve_figure(results, looks))
+    if len(results.tasks) > 1 and aggregates and (over_all := draw.iqm_curve_figure(results, looks)):
+        groups["curves"].append(over_all)
     return groups
 
 
@@ -158,7 +158,7 @@ def _sections(
         yield Section("aggregate", "Across datasets", parts)
     if "improvement" in found:
         yield Section("improvement", "Probability of improvement", [table(found["improvement"])])
-    words = "The BDB paper's Figure 4 shows the same of its datasets."
+    words = "The BDB paper's Figure 4 shows the same of its datasets." if "beside" in found else ""
     yield Section("curves", "Learning curves", [figures(pictures["curves"])], words)
     yield Section("finals", "Final scores, seed by seed", [figures(pictures["finals"])])
     if "beside" in found:

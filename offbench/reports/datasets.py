@@ -16,7 +16,7 @@ from offbench.reports.layout import Cell, Table
 from offbench.reports.markup import Markup, join, tag
 from offbench.reports.page import table
 from offbench.reports.tables import NONE
-from offbench.results import Results, Task
+from offbench.results import Results, Task, Trained
 
 SHOWN = 12  # digits of a content hash, in the cards as here
 
@@ -28,14 +28,27 @@ def dataset_table(results: Results) -> Table:
         runs = [trained for (found, _), entry in results.entries.items() if found == task for trained in entry.runs]
         envs = sorted({str(trained.config.get("env_id") or "") for trained in runs} - {""})
         rows.append(
-            [Cell(task.dataset), Cell(", ".join(envs) or "-"), *_sizes(task), Cell(task.content[:SHOWN])],
+            [
+                Cell(task.dataset),
+                Cell(", ".join(envs) or "-"),
+                *_sizes(task),
+                Cell(_scale(runs[0]) or "-"),
+                Cell(task.content[:SHOWN]),
+            ]
         )
-    header = ["dataset", "environment", "transitions", "episodes", "mean return", "content"]
+    header = ["dataset", "environment", "transitions", "episodes", "mean return", "score 0 to 100", "content"]
     notes = [
         "“content”: the first digits of the SHA-256 over a dataset's arrays, as each run's config.json has it. Sizes "
-        "and mean return were read where this report was written; “-”: no dataset of this content was there."
+        "and mean return were read where this report was written; “-”: no dataset of this content was there. “score 0 "
+        "to 100”: the returns of the random policy and of the expert that came with the dataset."
     ]
     return Table("datasets", "Datasets that the runs were trained on", header, rows, notes, 2)
+
+
+def _scale(trained: Trained) -> str:
+    """Return a run's references in words, "" if its dataset has none."""
+    pair = trained.config["references"].get("dataset")
+    return f"{pair[0]:,.1f} to {pair[1]:,.1f}" if pair else ""
 
 
 def _sizes(task: Task) -> list[Cell]:

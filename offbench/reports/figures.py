@@ -132,19 +132,26 @@ def profile_figure(found: Mapping[Method, tuple[Estimate, Scores]], looks: Mappi
     return _draw("profiles", caption, f"Performance profiles. Runs above 50: {text}.", paint, list(looks.values()))
 
 
-def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure:
-    """Draw the IQM over all tasks against the updates, of the methods that have all tasks, where their runs meet."""
-    tasks = {task for task in results.tasks if task.reference}
-    whole = [method for method in results.methods if tasks <= {entry.task for entry in results.of(method)}]
+def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure | None:
+    """Draw the IQM over all tasks against the updates, of the methods that have all tasks, where their runs meet.
+
+    Returns:
+        The figure, or None if no method has evaluations at a step of all tasks.
+    """
+    tasks = {task.name for task in results.tasks if task.reference}
+    whole: dict[Method, tuple[list[int], dict[str, Any]]] = {}
+    for method in results.methods:
+        curves = {e.task.name: e.common_curve() for e in results.of(method) if e.task.reference}
+        steps = sorted(set.intersection(*(set(found[0]) for found in curves.values()))) if curves else []
+        if steps and curves.keys() == tasks:
+            whole[method] = steps[:: max(1, len(steps) // 40)], curves
+    if not whole:
+        return None
 
     def paint(axes: Any) -> None:
-        for method in whole:
-            curves = {e.task.name: e.common_curve() for e in results.of(method) if e.task.reference}
-            steps = sorted(set.intersection(*(set(found[0]) for found in curves.values())))
-            shown = steps[:: max(1, len(steps) // 40)]
+        for method, (shown, curves) in whole.items():
             points = [iqm({t: v[:, s.index(step)].tolist() for t, (s, v) in curves.items()}, 2000) for step in shown]
-            if shown:
-                _band(axes, shown, points, looks[method])
+            _band(axes, shown, points, looks[method])
         axes.set(xlabel="updates", ylabel="IQM of normalised scores", title="all tasks")
 
     caption = "Interquartile mean over all tasks, 95% interval shaded; methods that have all tasks."

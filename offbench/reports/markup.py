@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 
 
 class Markup(str):
@@ -34,10 +35,12 @@ def join(*children: str | Markup) -> Markup:
 
 
 def breakable(text: str) -> Markup:
-    """Return short text as one piece; long text (variants, paths) may break after commas, slashes, equals signs."""
+    """Return short text as one piece; long text may break after commas (not those of 1,000), slashes, equals signs."""
     if len(text) <= SHORT:
         return tag("span", text, class_="short")
-    escaped = html.escape(text, quote=False)
-    for character in ",=/":
-        escaped = escaped.replace(character, f"{character}<wbr>")
-    return Markup(escaped)
+    return Markup(re.sub(r"(,(?!\d)|[=/])", r"\1<wbr>", html.escape(text, quote=False)))
+
+
+def prose(text: str) -> Markup:
+    """Return text with what stands between backticks as code."""
+    return join(*[tag("code", part) if i % 2 else part for i, part in enumerate(text.split("`"))])

@@ -11,7 +11,7 @@ from typing import Any
 
 from offbench.reports.figures import Figure, Line
 from offbench.reports.layout import Cell, Table
-from offbench.reports.markup import Markup, breakable, join, tag
+from offbench.reports.markup import Markup, breakable, join, prose, tag
 from offbench.reports.tables import cell_id
 from offbench.results import REFERENCES, Entry, Results
 from offbench.runs import Run, sessions
@@ -86,7 +86,7 @@ def table(found: Table, *, caption: bool = False, download: bool = True) -> Mark
             role="region",
             aria_label=found.title,
         ),
-        *[tag("p", note, class_="note") for note in found.notes],
+        *[tag("p", prose(note), class_="note") for note in found.notes],
         *([tag("p", "This table: ", *files, class_="files")] if download else []),
     )
 

@@ -131,12 +131,27 @@ def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
         notes.insert(1, "‡ a run became NaN or infinite and stopped: the number is of its evaluations before that.")
     if "unfinished" in states:
         notes.insert(1, "† training is not finished: the number is of the steps done so far and may still change.")
+    if torn := _torn(entries):
+        notes.append(
+            f"The datasets of {', '.join(torn)} were recorded with different references: their scores are on "
+            "different scales (the table of datasets has them)."
+        )
     if any(task.twin for task in results.tasks):
         notes.append(
             "A dataset named twice was recorded again with different content: the first digits of the content's hash, "
             "in brackets, tell them apart."
         )
     return notes
+
+
+def _torn(entries: Sequence[Entry]) -> list[str]:
+    """Return the environments whose datasets brought more than one pair of references."""
+    scales: dict[str, set[tuple[float, ...]]] = {}
+    for entry in entries:
+        for trained in entry.runs:
+            if entry.task.reference == "dataset":
+                scales.setdefault(entry.task.place[0], set()).add(tuple(trained.config["references"]["dataset"]))
+    return sorted(env for env, pairs in scales.items() if len(pairs) > 1)
 
 
 def scale(results: Results) -> str:
