@@ -12,11 +12,10 @@ from typing import Any
 import pytest
 
 import offbench
-from offbench import assess, transitions
+from offbench import assess
 from offbench.cli import main
 from offbench.files import write_json
 from offbench.registry import load_algorithm
-from offbench.reports.markup import breakable, prose
 from offbench.reports.tables import published
 from offbench.results import OURS, Method, Task, read_results
 from offbench.settings import fields
@@ -226,50 +225,6 @@ def test_a_real_training(medium: str, home: Path) -> None:
     ]
     written = json.loads((folders[-1] / "similarity.json").read_text())
     assert found["by Q (%)"] == f"{written['q_similar']:.1f} ± ?"
-
-
-def test_the_datasets_are_those_of_the_runs(medium: str, home: Path) -> None:
-    data = transitions.load(medium)
-    for algorithm, content in (("td3_bc", data.content), ("cql", "fedc" * 16)):
-        run = made_run(home / "runs", medium, algorithm, "default", 0, 50)
-        own = {"dataset_sha256": content, "env_id": data.env_id}
-        write_json(run.config_path, json.loads(run.config_path.read_text()) | own)
-    made_run(home / "runs", "my-data-v0", "td3_bc", "default", 0, 50)
-    page = Page(offbench.report(home / "runs", home / "out"))
-    assert "Datasets that the runs were trained on" in page.text
-    assert "Shipped cards" not in page.text  # none of these environments has one
-    found = {row["content"]: list(row.values()) for row in rows(home / "out" / "tables" / "datasets.csv")}
-    counts = [f"{len(data):,}", f"{len(data.ends):,}", f"{data.returns.mean():,.1f}"]
-    scale = "0.0 to 100.0"
-    assert found[data.content[:12]] == [medium, "InvertedPendulum-v5", *counts, scale, data.content[:12]]
-    # recorded again since, and not on this machine: nothing is known but what the runs say
-    assert found["fedcfedcfedc"] == [medium, "InvertedPendulum-v5", "-", "-", "-", scale, "fedcfedcfedc"]
-    assert found["000000000000"] == ["my-data-v0", "Hopper-v5", "-", "-", "-", scale, "000000000000"]
-
-
-@pytest.mark.parametrize("torn", [False, True])
-def test_datasets_of_one_environment_on_two_scales_are_named(home: Path, torn: bool) -> None:
-    references = ([0.0, 50.0 if torn else 100.0], [-10.0, 190.0])
-    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
-    made_run(home / "runs", "hopper-expert-v0", "td3_bc", "default", 0, 50, references=references)
-    page = Page(offbench.report(home / "runs", home / "out"))
-    assert ("The datasets of hopper were recorded with different references" in page.text) == torn
-
-
-def test_no_curve_over_all_tasks_without_a_method_that_has_them(home: Path) -> None:
-    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
-    made_run(home / "runs", "hopper-expert-v0", "bc", "default", 0, 50)
-    page = Page(offbench.report(home / "runs", home / "out"))
-    assert "all tasks, 95% interval shaded; methods" not in page.text
-    assert not list((home / "out").rglob("curves-iqm*"))
-
-
-def test_long_text_breaks_but_never_within_a_number() -> None:
-    assert breakable("2 seeds, 5,000 of 1,000,000 steps") == "2 seeds,<wbr> 5,000 of 1,000,000 steps"
-    assert breakable("bdb alpha=2.5,beta=0.25,hidden=64x64") == (
-        "bdb alpha=<wbr>2.5,<wbr>beta=<wbr>0.25,<wbr>hidden=<wbr>64x64"
-    )
-    assert prose("a < b, `offbench compare` says") == "a &lt; b, <code>offbench compare</code> says"
 
 
 @pytest.mark.parametrize("seeds", [2, 6])

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import offbench
 from offbench.reports.figures import shortened
+from offbench.reports.markup import breakable, prose
 from tests.made_runs import METHODS, made_grid
 from tests.pages import HOSTILE, Page, hostile_runs
 
@@ -59,3 +60,11 @@ def test_tables_are_accessible(home: Path) -> None:
     assert pictures
     assert all(len(a["aria-label"] or "") > 20 for a in pictures)
     assert dict(page.elements)["html"]["lang"] == "en"
+
+
+def test_long_text_breaks_but_never_within_a_number() -> None:
+    assert breakable("2 seeds, 5,000 of 1,000,000 steps") == "2 seeds,<wbr> 5,000 of 1,000,000 steps"
+    assert breakable("bdb alpha=2.5,beta=0.25,hidden=64x64") == (
+        "bdb alpha=<wbr>2.5,<wbr>beta=<wbr>0.25,<wbr>hidden=<wbr>64x64"
+    )
+    assert prose("a < b, `offbench compare` says") == "a &lt; b, <code>offbench compare</code> says"
