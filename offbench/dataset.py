@@ -211,8 +211,17 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
         with disk_errors(str(path)):
             _recover(path)
         if path.exists() and not overwrite:
-            raise OffbenchError(f"{dataset_id} exists already; use --overwrite to replace it, or --id for another id")
+            known = f"{dataset_id} exists already{_size(dataset_id)}"
+            raise OffbenchError(f"{known}; use --overwrite to replace it, or --id for another id")
         yield path
+
+
+def _size(dataset_id: str) -> str:
+    """Return a dataset's transitions in brackets, "" if its metadata do not say."""
+    try:
+        return f" ({read_metadata(dataset_id)['total_steps']:,} transitions)"
+    except (OffbenchError, KeyError, TypeError):
+        return ""
 
 
 def tidy(dataset_id: str) -> None:

@@ -183,9 +183,10 @@ class _Recording:
             rung = self.ladder.role(part.source)
             fraction = self.ladder.fraction(rung)
             if part.source == "medium" and not MEDIUM <= fraction <= MEDIUM_AT_MOST:
+                remedy = "" if self.recipe.folder else "; a shorter [sac] segment in the recipe gives more rungs"
                 print(
                     f"offbench: medium of {self.recipe.name} lies at {fraction:.2f} of the expert's return: "
-                    f"no rung of the training lies from {MEDIUM:.2f} to {MEDIUM_AT_MOST}",
+                    f"no rung of the training lies from {MEDIUM:.2f} to {MEDIUM_AT_MOST}{remedy}",
                     file=sys.stderr,
                 )
             return rung

@@ -55,6 +55,11 @@ class Run:
         """Every evaluation episode."""
         return self.folder / "evaluations.csv"
 
+    @property
+    def losses_path(self) -> Path:
+        """The mean of each logged quantity."""
+        return self.folder / "losses.csv"
+
     def config(self) -> dict[str, Any]:
         """Read config.json. Raises OffbenchError if it is missing or damaged."""
         if not self.config_path.exists():
@@ -159,11 +164,11 @@ class Run:
         """Replace losses.csv; a quantity that was not logged in a row stays empty."""
         columns = list(dict.fromkeys(key for row in rows for key in row))
         lines = ([_short(row.get(key, "")) for key in columns] for row in rows)
-        write_bytes(self.folder / "losses.csv", csv_bytes(columns, lines))
+        write_bytes(self.losses_path, csv_bytes(columns, lines))
 
     def losses(self) -> list[dict[str, float]]:
         """Read losses.csv ([] if there is none)."""
-        path = self.folder / "losses.csv"
+        path = self.losses_path
         if not path.exists():
             return []
         try:

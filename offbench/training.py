@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
@@ -162,6 +163,8 @@ class Trainer:
         for run, member in enumerate(self.members):
             if self.stack.step and not member.run.policy_path.exists():  # somebody deleted it: the checkpoint has it
                 self.stack.policy(run).save(member.run.policy_path)
+            if self.stack.step and not member.run.losses_path.exists():
+                print(f"offbench: {member.run.losses_path} is gone: its rows begin again here", file=sys.stderr)
             known, rows = member.run.evaluations(), member.run.losses()
             # an evaluation at the end of a shorter schedule may lie off this one's grid
             self.evaluations[run] = {s: e for s, e in known.items() if s <= self.stack.step and self._evaluates_at(s)}

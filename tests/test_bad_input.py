@@ -243,7 +243,7 @@ def test_bad_recipes(kind: str, home: Path, capsys: pytest.CaptureFixture[str]) 
 def test_an_existing_id(tiny: tuple[str, str], medium: str, capsys: pytest.CaptureFixture[str]) -> None:
     recipe, behaviour_dir = tiny
     line = refusal(["collect", recipe, "--behaviour-dir", behaviour_dir, "--seed", "5"], capsys)
-    assert "tiny-medium-v0 exists already; use --overwrite" in line
+    assert "tiny-medium-v0 exists already (600 transitions); use --overwrite" in line
 
 
 def test_more_replay_than_there_is(tiny: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -220,12 +220,17 @@ def test_a_run_whose_files_were_deleted_is_not_taken_for_another(medium: str) ->
         train("td3_bc", medium, "runs", 400)
 
 
-def test_a_deleted_policy_comes_back_from_the_checkpoint(medium: str) -> None:
+def test_a_deleted_policy_comes_back_from_the_checkpoint(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
     (run,) = train("td3_bc", medium, "runs", 300)
     policy, evaluations = run.policy_path.read_bytes(), run.evaluations_path.read_bytes()
     run.policy_path.unlink()
     train("td3_bc", medium, "runs", 300)
     assert (run.policy_path.read_bytes(), run.evaluations_path.read_bytes()) == (policy, evaluations)
+    run.losses_path.unlink()
+    capsys.readouterr()
+    train("td3_bc", medium, "runs", 400)
+    assert f"{run.losses_path} is gone: its rows begin again here" in capsys.readouterr().err
+    assert [row["step"] for row in run.losses()] == [400]
 
 
 def test_what_trained_a_run_later_is_noted_if_it_is_something_else(
