@@ -101,34 +101,12 @@ def pending(part: Part, schedule: Schedule, *, tf32: bool = False, command: str 
         OffbenchError: another run lives in a run's directory, or one is further than the schedule goes.
     """
     for order, member in zip(part.orders, part.members, strict=True):
-        check_whole(member.run, schedule, evaluates=bool(member.data.env_spec))
+        _check_whole(member.run, schedule, evaluates=bool(member.data.env_spec))
         member.run.claim(_config(order, member, schedule, tf32, command))
     order_of = {member.run.folder: order for order, member in zip(part.orders, part.members, strict=True)}
     left = [member for member in part.members if not member.run.diverged]
     stages = together(left, schedule.steps)
     return [Job(part.kind, tuple(order_of[m.run.folder] for m in stage), schedule, tf32) for stage in stages]
-
-
-def check_whole(run: Run, schedule: Schedule, evaluates: bool) -> None:
-    """Refuse a run that lacks what was written before its newest checkpoint: going on would give another score.
-
-    Raises:
-        OffbenchError: its config.json is gone, or an evaluation (unless it `evaluates` never).
-    """
-    newest = max(checkpoints.steps(run.folder), default=0)
-    if not newest:
-        return
-    if not run.config_path.exists():
-        raise OffbenchError(f"{run.folder} holds a run without its config.json; put it back, or delete the run")
-    known, every = run.evaluations(), schedule.eval_every
-    if run.config().get("eval_every") != every or not evaluates:
-        return  # claim says so, or there is nothing to lack
-    for step in range(every, newest, every):
-        if step not in known:
-            raise OffbenchError(
-                f"{run.evaluations_path} lacks the evaluation of step {step}; put the file back, or delete the run "
-                "to repeat it"
-            )
 
 
 def diverged(parts: Sequence[Part]) -> list[str]:
@@ -183,6 +161,28 @@ def together(members: Sequence[Member], steps: int) -> list[list[Member]]:
         groups.append(group)
         left = [member for member in left if member not in group]
     return groups
+
+
+def _check_whole(run: Run, schedule: Schedule, evaluates: bool) -> None:
+    """Refuse a run that lacks what was written before its newest checkpoint: going on would give another score.
+
+    Raises:
+        OffbenchError: its config.json is gone, or an evaluation (unless it `evaluates` never).
+    """
+    newest = max(checkpoints.steps(run.folder), default=0)
+    if not newest:
+        return
+    if not run.config_path.exists():
+        raise OffbenchError(f"{run.folder} holds a run without its config.json; put it back, or delete the run")
+    known, every = run.evaluations(), schedule.eval_every
+    if run.config().get("eval_every") != every or not evaluates:
+        return  # claim says so, or there is nothing to lack
+    for step in range(every, newest, every):
+        if step not in known:
+            raise OffbenchError(
+                f"{run.evaluations_path} lacks the evaluation of step {step}; put the file back, or delete the run "
+                "to repeat it"
+            )
 
 
 def _config(order: Order, member: Member, schedule: Schedule, tf32: bool, command: str) -> dict[str, Any]:
