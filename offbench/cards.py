@@ -23,7 +23,7 @@ from offbench.describe import Summary, show
 from offbench.errors import OffbenchError
 from offbench.files import read_json, write_bytes, write_json
 from offbench.ladder import BEHAVIOUR, Ladder, find_ladder
-from offbench.levels import LEVELS
+from offbench.levels import LEVELS, full_size
 from offbench.provenance import versions
 from offbench.recipes import Recipe, load_recipe
 from offbench.scores import normalize
@@ -96,7 +96,7 @@ def _recorded(recipe: Recipe, ladder: Ladder, level: str) -> Summary:
     found = show(dataset_id)
     ours = dataset.provenance(found.metadata)
     parts = LEVELS[level]
-    size = recipe.dataset_steps * sum(part.weight for part in parts)
+    size = full_size(parts, recipe.dataset_steps)
     if parts[0].source == "replay":
         size = int(ladder.info["medium_replay"]["transitions"])
     same = ours.get("references") == ladder.info["references"] and ours.get("seed") == 0

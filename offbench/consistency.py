@@ -13,7 +13,7 @@ from offbench.environments import same_environment
 from offbench.errors import OffbenchError
 from offbench.grid import Source
 from offbench.ladder import Ladder
-from offbench.levels import parse_level
+from offbench.levels import full_size, parse_level
 from offbench.recipes import Recipe, load_recipe
 
 
@@ -48,7 +48,7 @@ def _differences(metadata: dict[str, Any], source: Source, recipe: Recipe) -> It
         yield f"seed {ours['seed']}, not {source.seed}"
     _, parts = parse_level(source.level)
     if source.steps or parts[0].source != "replay":  # a replay is as long as the training made it
-        wanted = source.steps or round(recipe.dataset_steps * sum(part.weight for part in parts))
+        wanted = source.steps or full_size(parts, recipe.dataset_steps)
         if ours and metadata.get("total_steps", wanted) != wanted:
             yield f"{metadata['total_steps']:,} transitions, not {wanted:,}"
 

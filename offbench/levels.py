@@ -76,6 +76,11 @@ def parse_mix(text: str) -> tuple[str, tuple[Part, ...]]:
     return "-".join(names), tuple(parts)
 
 
+def full_size(parts: tuple[Part, ...], dataset_steps: int) -> int:
+    """Return the transitions of a level, `dataset_steps` being the recipe's of one part."""
+    return round(dataset_steps * sum(part.weight for part in parts))
+
+
 def _number(text: str) -> float | None:
     try:
         value = float(text)

@@ -18,7 +18,7 @@ from offbench.errors import OffbenchError
 from offbench.grid import Entry, Grid, Source, Times, load_grid
 from offbench.jobs import Order
 from offbench.launch import configurations
-from offbench.levels import parse_level
+from offbench.levels import full_size, parse_level
 from offbench.progress import duration
 from offbench.recipes import Recipe, load_recipe
 from offbench.registry import load_algorithm
@@ -221,7 +221,7 @@ def _size(source: Source) -> int:
     if source.steps or not source.env:
         return source.steps or 0
     _, parts = parse_level(source.level)
-    return round(_recipe(source).dataset_steps * sum(part.weight for part in parts))
+    return full_size(parts, _recipe(source).dataset_steps)
 
 
 def _bytes_per_step(spec: str) -> int:

@@ -20,7 +20,7 @@ from offbench.errors import OffbenchError
 from offbench.files import sha256
 from offbench.grid import Source
 from offbench.ladder import BEHAVIOUR, MEDIUM, MEDIUM_AT_MOST, Ladder, Rung, find_ladder
-from offbench.levels import Part, parse_level, parse_mix, shares
+from offbench.levels import Part, full_size, parse_level, parse_mix, shares
 from offbench.policy import Policy, uniform
 from offbench.progress import Progress, duration
 from offbench.provenance import versions
@@ -152,7 +152,7 @@ def _counts(recipe: Recipe, ladder: Ladder, parts: tuple[Part, ...], steps: int 
     available = int(ladder.info["medium_replay"]["transitions"])
     if steps is None and len(parts) == 1 and parts[0].source == "replay":
         return [available]
-    total = steps if steps is not None else round(recipe.dataset_steps * sum(part.weight for part in parts))
+    total = steps if steps is not None else full_size(parts, recipe.dataset_steps)
     counts = shares(parts, total)
     if 0 in counts:
         raise OffbenchError(f"{total} steps leave a part of the blend without a transition; use more --steps")

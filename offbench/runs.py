@@ -86,21 +86,24 @@ class Run:
         """Write config.json, or check that the run in this directory is the same one.
 
         Raises:
-            OffbenchError: another run lives here.
+            OffbenchError: another run lives here, or one whose config.json is gone.
         """
         if self.config_path.exists():
             known = self.config()
             for key in MUST_MATCH:
-                if known.get(key) != config[key] and key == "dataset_sha256":
+                if known.get(key) == config[key]:
+                    continue
+                if key == "dataset_sha256":
                     raise OffbenchError(
                         f"{self.folder} was trained on another content of {config['dataset']}, which has been "
                         "recorded again since; delete that run or give another --runs"
                     )
-                if known.get(key) != config[key]:
-                    raise OffbenchError(
-                        f"{self.folder} holds a run with {key} {known.get(key)!r}, not {config[key]!r}; "
-                        "delete it or give another --runs"
-                    )
+                raise OffbenchError(
+                    f"{self.folder} holds a run with {key} {known.get(key)!r}, not {config[key]!r}; "
+                    "delete it or give another --runs"
+                )
+        elif any(self.folder.glob("checkpoint-*.safetensors")):
+            raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
         else:
             write_json(self.config_path, config)
 

@@ -79,16 +79,16 @@ class Program:
         batch = self.store.batch(self.indices.index_select(0, self.position)[0])
         noise = {name: values.index_select(0, self.position)[0] for name, values in self.noise.items()}
         logs = self.algorithm.update(batch, noise, kind)
-        where = f"{type(self.algorithm).__name__}.update"
         if kind not in self._names:
-            check_logs(logs, len(self.store.sizes), where)
+            check_logs(logs, len(self.store.sizes), f"{type(self.algorithm).__name__}.update")
+            self._names[kind] = list(logs)
         elif self._names[kind] != list(logs):  # a captured graph would go on with those of the first update
+            where = f"{type(self.algorithm).__name__}.update"
             raise OffbenchError(f"{where} must log the same names at every update of kind {kind!r}")
         for name, value in logs.items():
             if name not in self.sums:
                 self.sums[name] = torch.zeros_like(value)
             self.sums[name] += value
-        self._names[kind] = list(logs)
         self.position += 1
 
     def logged(self) -> dict[str, list[float]]:

@@ -98,11 +98,12 @@ def pending(part: Part, schedule: Schedule, *, tf32: bool = False, command: str 
     """Claim the runs' directories, and return what is left to train of them.
 
     Raises:
-        OffbenchError: another run lives in a run's directory, or one is further than the schedule goes.
+        OffbenchError: another run lives in a run's directory, one lacks files, or is further than the schedule goes.
     """
     for order, member in zip(part.orders, part.members, strict=True):
-        _check_whole(member.run, schedule, evaluates=bool(member.data.env_spec))
         member.run.claim(_config(order, member, schedule, tf32, command))
+        if member.data.env_spec:
+            _check_evaluations(member.run, schedule.eval_every)
     order_of = {member.run.folder: order for order, member in zip(part.orders, part.members, strict=True)}
     left = [member for member in part.members if not member.run.diverged]
     stages = together(left, schedule.steps)
@@ -163,20 +164,11 @@ def together(members: Sequence[Member], steps: int) -> list[list[Member]]:
     return groups
 
 
-def _check_whole(run: Run, schedule: Schedule, evaluates: bool) -> None:
-    """Refuse a run that lacks what was written before its newest checkpoint: going on would give another score.
-
-    Raises:
-        OffbenchError: its config.json is gone, or an evaluation (unless it `evaluates` never).
-    """
-    newest = max(checkpoints.steps(run.folder), default=0)
-    if not newest:
+def _check_evaluations(run: Run, every: int) -> None:
+    """Refuse a run that lacks an evaluation from before its newest checkpoint: going on would give another score."""
+    if not (newest := max(checkpoints.steps(run.folder), default=0)):
         return
-    if not run.config_path.exists():
-        raise OffbenchError(f"{run.folder} holds a run without its config.json; put it back, or delete the run")
-    known, every = run.evaluations(), schedule.eval_every
-    if run.config().get("eval_every") != every or not evaluates:
-        return  # claim says so, or there is nothing to lack
+    known = run.evaluations()
     for step in range(every, newest, every):
         if step not in known:
             raise OffbenchError(

@@ -27,6 +27,7 @@ from offbench.planning import Plan, prepare
 from offbench.recipes import load_recipe
 from offbench.registry import load_algorithm
 from offbench.runs import Run, find_runs
+from offbench.settings import fields as settings_of
 from offbench.tables import score_runs
 from tests.made_runs import made_run
 from tests.speed.arithmetic import ALGORITHMS
@@ -336,3 +337,14 @@ def test_values_that_make_separate_stacks_train_in_one_command(medium: str) -> N
     folders = offbench.train("td3_bc", medium, batch_size=[8, 16], **sizes)
     assert [folder.parent.name for folder in folders] == ["batch_size=8,hidden=8", "batch_size=16,hidden=8"]
     assert all((folder / "policy.safetensors").exists() for folder in folders)
+
+
+def test_help_lists_the_words_that_a_setting_may_be(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["train", "bdb", "--help"])
+    assert stopped.value.code == 0
+    said = " ".join(capsys.readouterr().out.split())
+    for name, field in settings_of(load_algorithm("bdb").Config).items():
+        if words := field.metadata["choices"]:
+            assert f"({' | '.join(words)}; default: {field.default})" in said, name
+    assert "(default: 256,256)" in said
