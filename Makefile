@@ -25,7 +25,7 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-# Speed against others and against the machine, into docs/benchmarks.md. d3rlpy has an environment of its own.
+# Speed against others and against the machine, into docs/benchmarks-KIND.md. d3rlpy has an environment of its own.
 bench: $(STAMP) .venv-d3rlpy/bin/python
 	$(BIN)/python -m pip install -q -c constraints.txt "minari[create]"
 	$(BIN)/python -m tests.speed

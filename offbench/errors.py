@@ -13,6 +13,6 @@ class OffbenchError(Exception):
 def unknown(what: str, name: str, known: Iterable[str]) -> OffbenchError:
     """Return the error for a `name` that is not among the `known` ones, with the nearest suggested."""
     names = sorted(known)
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names) or 'none'}"
     return OffbenchError(f"unknown {what} {name!r}: {hint}")

@@ -1,8 +1,8 @@
 """The forward and backward pass of many equal perceptrons, written out.
 
-Autograd would do the same, slower. On a CPU the larger products go to oneDNN, which on some processors is much faster
-than what `@` calls (`make bench` compares them) and applies the activation on its way, and only the gradients that
-somebody asks for are computed. On a GPU all perceptrons are one batched product a layer.
+Autograd would do the same, slower. On a CPU each product goes to the faster of PyTorch's two libraries: oneDNN, which
+also applies the activation on its way, or what `@` calls (`make bench` compares them). Only the gradients that are asked
+for are computed. On a GPU all perceptrons are one batched product a layer.
 
     x [nets, batch, in],  flat [nets, P] = W0 [in, h] | b0 [h] | W1 [h, h] | b1 [h] | ... | 0  ->  [nets, batch, out]
 """
@@ -16,8 +16,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# Multiplications of a product below which a call of oneDNN costs more than it saves, measured over a range of shapes.
+# Which library is faster was measured over a range of shapes, on a processor of each kind. Processor and shape decide,
+# never the clock: a run must be the same each time. Where PyTorch has AVX-512, oneDNN does the larger products in half
+# the time on AMD's processors, on which the other library keeps to AVX2. Elsewhere the other one is ahead, but for
+# products with very few columns.
+WIDE: bool = torch.backends.cpu.get_cpu_capability().startswith("AVX512")
+# Multiplications of a product below which a call of oneDNN costs more than it saves.
 WORTH_IT, WORTH_IT_WHEN_NARROW = 2**17, 2**21
+FEW_COLUMNS = 8
 Layer = tuple[Tensor, Tensor]  # weight [.., in, out], bias [.., out]
 HAS_ONEDNN: bool = torch._C._has_mkldnn and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
@@ -55,7 +61,8 @@ class _Perceptrons(torch.autograd.Function):
     def forward(ctx: Any, flat: Tensor, x: Tensor, sizes: tuple[int, ...], activation: str) -> Tensor:
         out, ctx.nets, kept = _forward(flat, x, sizes, activation)
         ctx.save_for_backward(flat, *kept)  # flat, whose views the layers are: autograd sees if it was changed
-        ctx.activation, ctx.used = activation, sum((i + 1) * o for i, o in itertools.pairwise(sizes))
+        ctx.sizes, ctx.activation = sizes, activation
+        ctx.used = sum((i + 1) * o for i, o in itertools.pairwise(sizes))
         return out
 
     @staticmethod
@@ -63,21 +70,20 @@ class _Perceptrons(torch.autograd.Function):
         flat, *kept = ctx.saved_tensors
         of_flat, of_x = ctx.needs_input_grad[:2]
         depth = len(kept) // len(ctx.nets)
-        behind = flat.new_zeros(*flat.shape[:-1], flat.shape[-1] - ctx.used)
-        flat_grads: list[Tensor] = []
-        x_grads: list[Tensor] = []
-        for group, (layers, grad, rest) in enumerate(zip(ctx.nets, _each(grads[0]), _each(behind), strict=True)):
-            parts = [rest]
+        of_nets, x_grads = torch.empty_like(flat) if of_flat else None, list[Tensor]()
+        if of_nets is not None:
+            of_nets[..., ctx.used :] = 0
+        for group, (layers, grad) in enumerate(zip(ctx.nets, _each(grads[0]), strict=True)):
+            own = _layers(_each(of_nets)[group], ctx.sizes) if of_nets is not None else []
             for layer in reversed(range(depth)):
                 weight, h = layers[layer][0], kept[group * depth + layer]
-                if of_flat:
-                    parts += [grad.sum(-2), product(h.mT, grad).flatten(-2)]
+                if own:
+                    product(h.mT, grad, out=own[layer][0])
+                    torch.sum(grad, -2, out=own[layer][1])
                 if layer:
                     grad = _before(product(grad, weight.mT), h, ctx.activation)
                 elif of_x:
                     x_grads.append(product(grad, weight.mT))
-            flat_grads += parts[::-1]
-        of_nets = torch.cat(flat_grads, -1).view(flat.shape) if of_flat else None
         return of_nets, _together(x_grads) if of_x else None, None, None
 
 
@@ -115,9 +121,12 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor, activation: str) -> Tensor:
     return out if activation == "none" else out.relu_() if activation == "relu" else out.tanh_()
 
 
-def product(a: Tensor, b: Tensor) -> Tensor:
-    """Return a @ b [.., m, n]."""
-    return _linear(a, b.mT, None, "none") if _onednn(a, b) else a @ b
+def product(a: Tensor, b: Tensor, out: Tensor | None = None) -> Tensor:
+    """Return a @ b [.., m, n], in `out` if it is given."""
+    if not _onednn(a, b):
+        return torch.matmul(a, b, out=out)
+    found = _linear(a, b.mT, None, "none")
+    return found if out is None else out.copy_(found)
 
 
 def _before(grad: Tensor, h: Tensor, activation: str) -> Tensor:
@@ -131,7 +140,9 @@ def _onednn(a: Tensor, b: Tensor) -> bool:
     if not HAS_ONEDNN or a.dim() > 2 or a.dtype != torch.float32 or a.is_cuda:
         return False
     (m, k), n = a.shape, b.shape[1]
-    return n > 1 and m * k * n >= (WORTH_IT if k >= 64 else WORTH_IT_WHEN_NARROW)
+    if n == 1 or (n > FEW_COLUMNS and not WIDE):
+        return False
+    return m * k * n >= (WORTH_IT if k >= 64 else WORTH_IT_WHEN_NARROW)
 
 
 def _linear(a: Tensor, b: Tensor, bias: Tensor | None, activation: str) -> Tensor:

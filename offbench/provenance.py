@@ -26,8 +26,11 @@ def versions() -> dict[str, str]:
 
 
 def hardware() -> dict[str, Any]:
-    """Return processor and cores, for provenance."""
-    return {"hardware": {"processor": _processor(), "cores": os.cpu_count(), "machine": platform.machine()}}
+    """Return processor and cores, for provenance. `vectors`: the instructions PyTorch uses; a run's bits follow."""
+    import torch  # not by those who ask for versions alone
+
+    processor = {"processor": _processor(), "vectors": torch.backends.cpu.get_cpu_capability()}
+    return {"hardware": processor | {"cores": os.cpu_count(), "machine": platform.machine()}}
 
 
 def made_with(device: str, tf32: bool) -> dict[str, Any]:

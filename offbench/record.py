@@ -216,7 +216,7 @@ class _Recording:
             return
         with Rollouts(self.spec, self.workers if self.workers > 1 else 0) as rollouts:
             # the part is in the seed, so that both halves of medium-expert have their own episodes
-            endless = rollouts.episodes(self.policy(rung), self.seed, (index,))
+            endless = rollouts.episodes(self.policy(rung), self.seed, (index,), enough=count)
             try:
                 yield from cut_at(endless, count)
             finally:

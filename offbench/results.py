@@ -205,13 +205,13 @@ def read_results(root: str | Path) -> Results:
     entries, waiting = entries_of(find_runs(Path(root)))
     if not entries:
         raise OffbenchError(f"no evaluated runs below {root}; start one with `offbench train ALGO --dataset ID`")
-    tasks = sorted({entry.task for entry in entries}, key=_task_order)
+    tasks = dict.fromkeys(entry.task for entry in entries)
     methods = sorted({entry.method for entry in entries}, key=_method_order)
     return Results(Path(root), tuple(tasks), tuple(methods), {(e.task, e.method): e for e in entries}, tuple(waiting))
 
 
 def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
-    """Return runs as entries, sorted by dataset, algorithm and variant, and the runs that have no evaluation yet.
+    """Return runs as entries in the order of the paper's table, and the runs that have no evaluation yet.
 
     Raises:
         OffbenchError: one is damaged, or there twice.
@@ -232,7 +232,7 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
         _check_seeds(group)
         method = Method(algorithm, variant, _beta(group[0].config["settings"].get("beta")))
         entries.append(Entry(tasks[dataset, content], method, tuple(group)))
-    entries.sort(key=lambda e: (e.task.dataset, e.method.algorithm, e.method.variant, e.task.content))
+    entries.sort(key=lambda entry: (_task_order(entry.task), _method_order(entry.method)))
     return entries, waiting
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import collections
 import functools
+import math
 import multiprocessing
 import os
 import threading
@@ -32,8 +33,9 @@ from offbench.scores import interval
 from offbench.seeds import Purpose
 from offbench.workers import closing, quiet_start, start_worker
 
-LANES = 8  # episodes that share a policy forward
+LANES = 16  # episodes that share a policy forward
 TASK = 16  # episodes that travel together
+LAST_TASK = 4  # where a recording ends, fewer travel together
 NOISE_BLOCK = 1024  # actions whose noise is drawn at once
 
 
@@ -150,8 +152,8 @@ def play(task: Task) -> list[Episode] | list[Outcome]:
     while lanes:
         if closing():
             raise CancelledError
-        observations = np.stack([lane.observations[-1] for lane in lanes])
-        noise = np.stack([lane.next_noise() for lane in lanes]) if noisy else None
+        observations = np.array([lane.observations[-1] for lane in lanes])
+        noise = np.array([lane.next_noise() for lane in lanes]) if noisy else None
         actions = policy.act(observations, noise)
         going = []
         for lane, action in zip(lanes, actions, strict=True):
@@ -223,20 +225,34 @@ class Rollouts:
         future.set_result(function(*arguments))
         return future
 
-    def episodes(self, policy: Policy, seed: int, stream: tuple[int, ...] = ()) -> Iterator[Episode]:
-        """Yield episodes 0, 1, 2, ... of the sampling policy without end, in order. Close the iterator when done."""
+    def episodes(
+        self, policy: Policy, seed: int, stream: tuple[int, ...] = (), enough: int | None = None
+    ) -> Iterator[Episode]:
+        """Yield episodes 0, 1, 2, ... of the sampling policy without end, in order. Close the iterator when done.
+
+        Args:
+            enough: transitions after which nobody will ask for more: near them tasks become small, and none begins
+                that is not likely to be wanted.
+        """
         data, ahead = policy.to_bytes(), 1 if not self._pool else 2 * self.workers + 1
         pending: collections.deque[Future[Any]] = collections.deque()
-        first = 0
+        begun = done = steps = 0
         try:
             while True:
                 while len(pending) < ahead:
                     # the first tasks are small, so that short recordings keep every worker busy
-                    size = LANES if first < LANES * ahead else TASK
-                    indices = tuple(range(first, first + size))
+                    size = LANES if begun < LANES * ahead else TASK
+                    if enough is not None and done:
+                        wanted = (enough - steps) * done / steps - (begun - done)  # if all are as long as those so far
+                        if wanted <= 0 and pending:
+                            break
+                        size = min(size, max(LAST_TASK, math.ceil(wanted / ahead)))
+                    indices = tuple(range(begun, begun + size))
                     pending.append(self.submit(Task(self.spec, data, seed, stream, indices, False, False)))
-                    first += size
-                yield from result(pending.popleft())
+                    begun += size
+                for episode in result(pending.popleft()):
+                    done, steps = done + 1, steps + len(episode)
+                    yield episode
         finally:
             for future in pending:
                 future.cancel()

@@ -13,7 +13,8 @@ from offbench import perceptron
 from offbench.perceptron import perceptrons
 
 ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
-SMALL, LARGE = ((5, 7, 6, 2), 11), ((14, 128, 96, 1), 128)  # the large one's middle layer is oneDNN's
+SMALL, LARGE = ((5, 7, 6, 2), 11), ((14, 128, 96, 1), 128)  # the large one's middle layer is oneDNN's, with AVX-512
+FEW = ((14, 128, 8), 128)  # without AVX-512 oneDNN does its last layer, which has few columns
 
 
 def reference(flat: Tensor, x: Tensor, sizes: Sequence[int], activation: str) -> Tensor:
@@ -41,14 +42,15 @@ def made(sizes: Sequence[int], batch: int, nets: int) -> tuple[Tensor, Tensor, T
     )
 
 
-@pytest.mark.parametrize("way", ["as on a GPU", "one by one", "one by one with oneDNN"])
+@pytest.mark.parametrize("way", ["as on a GPU", "one by one", "one by one with AVX-512", "one by one with AVX2"])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("nets", [1, 3])
-@pytest.mark.parametrize(("sizes", "batch"), [SMALL, LARGE])
+@pytest.mark.parametrize(("sizes", "batch"), [SMALL, LARGE, FEW])
 def test_outputs_and_gradients_are_autograds(
     sizes: Sequence[int], batch: int, nets: int, activation: str, way: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(perceptron, "HAS_ONEDNN", perceptron.HAS_ONEDNN and way.endswith("oneDNN"))
+    monkeypatch.setattr(perceptron, "HAS_ONEDNN", perceptron.HAS_ONEDNN and "AVX" in way)
+    monkeypatch.setattr(perceptron, "WIDE", way.endswith("AVX-512"))
     monkeypatch.setattr(perceptron, "_batched", lambda _: way == "as on a GPU")
     flat, x, grad = (part.requires_grad_() for part in made(sizes, batch, nets))
     wanted = reference(flat, x, sizes, activation)
@@ -85,3 +87,14 @@ def test_one_of_many_is_the_same_as_alone() -> None:
     for place in range(3):
         alone = perceptrons(flat[place : place + 1], x[place : place + 1], LARGE[0], "relu")
         assert torch.equal(together[place : place + 1], alone)
+
+
+@pytest.mark.parametrize(("wide", "wanted"), [(True, [True, True, False]), (False, [False, True, False])])
+def test_the_library_follows_from_processor_and_shape(
+    wide: bool, wanted: list[bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Large, few columns, a single column; never from the clock, or a run would not be the same twice."""
+    monkeypatch.setattr(perceptron, "HAS_ONEDNN", True)
+    monkeypatch.setattr(perceptron, "WIDE", wide)
+    shapes = [((256, 256), (256, 256)), ((256, 256), (256, 3)), ((256, 256), (256, 1))]
+    assert [perceptron._onednn(torch.zeros(a), torch.zeros(b)) for a, b in shapes] == wanted

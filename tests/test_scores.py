@@ -85,8 +85,8 @@ def test_the_table_of_runs_by_hand() -> None:
     write_run(1, [30.0, 90.0])
     write_run(0, [200.0], "beta=0.5", d4rl=None)
     rows = offbench.normalize("runs")
-    assert [row["variant"] for row in rows] == ["beta=0.5", "default"]
-    one, two = rows
+    assert [row["variant"] for row in rows] == ["default", "beta=0.5"]
+    two, one = rows
     assert (one["seeds"], one["score"], one["score_std"], one["d4rl_score"]) == (1, 100.0, None, None)
     assert (two["seeds"], two["steps"], two["evaluations"], two["return"]) == (2, 100, 1, 80.0)
     assert two["score"] == 40.0

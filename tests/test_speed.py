@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import platform
+import subprocess
+import sys
+
 import pytest
 
 from tests.speed.__main__ import environment, line
@@ -34,3 +38,27 @@ def test_a_row_that_misses_its_target_says_so() -> None:
     assert line(found | {"at_least": 0.6, "aim": 0.8})[4] == "**no**"
     assert line(found | {"at_least": 0.59, "aim": 0.8})[4] == "yes"
     assert line(found | {"at_least": None, "aim": None})[4] == ""
+
+
+FAULTS = """
+import resource, torch
+from offbench.devices import arithmetic
+
+def update():
+    large = [torch.ones(2**21) for _ in range(8)]  # 64 MB, of which glibc by itself would keep half
+    return float(large[0][0])
+
+with arithmetic("cpu", tf32=False):
+    update()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(10):
+        update()
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library's memory is its own affair")
+def test_a_training_keeps_the_memory_that_an_update_frees() -> None:
+    """64 MB are 16,384 pages: few of them are asked for again."""
+    found = subprocess.run([sys.executable, "-c", FAULTS], check=True, capture_output=True, text=True)
+    assert int(found.stdout) < 4000

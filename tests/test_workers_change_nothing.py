@@ -14,10 +14,11 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 
 import offbench
 from offbench import dataset, seeds
-from offbench.environments import env_spec
+from offbench.environments import env_spec, make_env
 from offbench.errors import OffbenchError
 from offbench.policy import uniform
 from offbench.record import cut_at
@@ -80,6 +81,56 @@ def test_more_episodes_than_lanes_keep_their_order() -> None:
         (alone,) = play(Task(spec, policy.to_bytes(), 0, (), (index,), False, False))
         assert isinstance(alone, Episode)
         np.testing.assert_array_equal(alone.observations, together[index].observations)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("env_id", ["Hopper-v5", "Walker2d-v5", "HalfCheetah-v5", "Pendulum-v1"])
+def test_a_made_environment_is_gymnasiums(env_id: str) -> None:
+    """Over a reset in mid-episode too: whether a walker is healthy is remembered for one step alone."""
+    ours, theirs = make_env(env_spec(env_id)), gym.make(env_id)
+    theirs.action_space.seed(0)
+    for seed, length in ((0, 5), (1, 400)):
+        np.testing.assert_array_equal(ours.reset(seed=seed)[0], theirs.reset(seed=seed)[0])
+        for _ in range(length):
+            action = theirs.action_space.sample()
+            one, other = ours.step(action), theirs.step(action)
+            np.testing.assert_array_equal(one[0], other[0])
+            assert one[1:4] == other[1:4]
+            if one[2] or one[3]:
+                break
+    ours.close()
+    theirs.close()
+
+
+def test_a_walker_works_out_once_a_step_whether_it_is_healthy(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[bool] = []
+    healthy = HopperEnv.is_healthy.fget  # type: ignore[attr-defined]
+    monkeypatch.setattr(HopperEnv, "is_healthy", property(lambda env: asked.append(True) or healthy(env)))
+    env = make_env(env_spec("Hopper-v5"))
+    env.reset(seed=0)
+    for steps in range(1, 4):
+        env.step(np.zeros(3))
+        assert len(asked) == steps
+    env.close()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_no_more_episodes_are_played_than_are_likely_to_be_wanted(
+    workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec, policy, enough = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5"), 8000
+    begun: list[int] = []
+    submit = Rollouts.submit
+    monkeypatch.setattr(Rollouts, "submit", lambda self, task: begun.extend(task.indices) or submit(self, task))
+    found = []
+    for told in (None, enough):
+        begun.clear()
+        with Rollouts(spec, workers) as rollouts:
+            endless = rollouts.episodes(policy, 0, enough=told)
+            found.append([episode.observations for episode in cut_at(endless, enough)])
+            endless.close()  # type: ignore[attr-defined]
+    assert all(np.array_equal(one, other) for one, other in zip(*found, strict=True))
+    assert begun == list(range(len(begun)))
+    assert len(begun) - len(found[1]) < LANES  # some 360 are wanted
 
 
 def test_the_last_episode_is_cut_and_truncated() -> None:

@@ -176,7 +176,8 @@ def beside_table(results: Results) -> Table | None:
         source = (f"{row['source']}, {row['dataset_version']}", row["protocol"])
         place = (row["env"], row["level"], row["method"])
         numbers.setdefault(place, {})[source] = f"{float(row['normalized_score']):g}{spread}"
-    known = [(e, numbers[p]) for e in _in_order(results) if (p := (*e.task.place, e.method.published)) in numbers]
+    entries = results.entries.values()
+    known = [(e, numbers[p]) for e in entries if (p := (*e.task.place, e.method.published)) in numbers]
     sources = list(dict.fromkeys(source for _, found in known for source in found))
     if not known:
         return None
@@ -262,7 +263,7 @@ def _chance(estimate: Estimate | None, better: bool) -> Cell:
 def seed_table(results: Results) -> Table:
     """Return every run with its score and how far it is."""
     rows = []
-    for entry in _in_order(results):
+    for entry in results.entries.values():
         for trained in entry.runs:
             score, ret = trained.score(entry.task.reference), trained.score(None)
             rows.append(
@@ -301,8 +302,3 @@ def _waiting_name(results: Results, config: Mapping[str, Any]) -> str:
     contents = {task.content for task in results.tasks if task.dataset == config["dataset"]}
     twin = bool(contents) and contents != {config["dataset_sha256"]}
     return Task(config["dataset"], config["dataset_sha256"], None, twin).name
-
-
-def _in_order(results: Results) -> list[Entry]:
-    keys = ((task, method) for task in results.tasks for method in results.methods)
-    return [results.entries[key] for key in keys if key in results.entries]

@@ -1,4 +1,4 @@
-"""Run the rows, write docs/benchmarks.md, and say which targets were missed."""
+"""Run the rows, write docs/benchmarks-KIND.md (of processor), and say which targets were missed."""
 
 from __future__ import annotations
 
@@ -67,13 +67,12 @@ def line(found: dict[str, Any]) -> list[str]:
 
 
 def page(results: list[dict[str, Any]], grown: list[tuple[str, dict[str, Any]]]) -> str:
-    """Return docs/benchmarks.md: the fixed text with this run's tables in it."""
+    """Return the page: the fixed text with this run's tables in it."""
     made = hardware()["hardware"]
     peer = "d3rlpy 2.8.1"
     where = (
-        f"{datetime.date.today().isoformat()}, {made['processor']}, {cores()} cores, {platform.system()}; "
-        + ", ".join(f"{name} {version}" for name, version in versions().items())
-        + f"; {peer}"
+        f"{datetime.date.today().isoformat()}, {made['processor']} ({made['vectors']}), {cores()} cores, "
+        f"{platform.system()}; " + ", ".join(f"{name} {version}" for name, version in versions().items()) + f"; {peer}"
     )
     header = [
         "ours vs theirs",
@@ -91,6 +90,7 @@ def page(results: list[dict[str, Any]], grown: list[tuple[str, dict[str, Any]]])
     ]
     text = (Path(__file__).parent / "page.md").read_text(encoding="utf-8")
     return text.format(
+        vectors=made["vectors"],
         where=where,
         table="\n".join(markdown(header, [line(found) for found in results])),
         growth="\n".join(
@@ -126,9 +126,10 @@ def main() -> None:
                 grown.append((what, measure(row, arguments.quick)))
                 print(row.name, what, f"{grown[-1][1]['ratio']:.2f}", flush=True)
     if not arguments.quick and not arguments.only:
-        write_bytes(DOCS / "benchmarks.md", page(results, grown).encode())
+        path = DOCS / f"benchmarks-{hardware()['hardware']['vectors'].lower()}.md"
+        write_bytes(path, page(results, grown).encode())
         missed = [found["name"] for found in results if found["at_least"] and found["ratio"] < found["at_least"]]
-        print(f"docs/benchmarks.md written; targets missed: {', '.join(missed) or 'none'}")
+        print(f"docs/{path.name} written; targets missed: {', '.join(missed) or 'none'}")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import multiprocessing
 import os
@@ -17,17 +18,17 @@ from tests.speed.side import Work, serve
 
 ENV = "hopper"
 BATCH, HIDDEN = 256, (256, 256)
+ARITHMETIC = contextlib.ExitStack()  # what trainings set; left as this process ends
 
 
 def train(algorithm: str, runs: str = "1", rows: str = "100000", hidden: str = "256,256") -> Work:
     """Updates of a stack; a unit is one run's update."""
-    import torch
-
+    from offbench.devices import arithmetic
     from offbench.registry import load_algorithm
     from offbench.settings import build
     from offbench.stack import Stack
 
-    torch.set_num_threads(1)
+    ARITHMETIC.enter_context(arithmetic("cpu", tf32=False))
     kind = load_algorithm(algorithm)
     config: Any = build(kind.Config, {"hidden": hidden} | ({"bc_steps": 0} if algorithm == "cql" else {}), algorithm)
     member = _member(algorithm, config, int(rows))
