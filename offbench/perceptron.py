@@ -1,8 +1,8 @@
 """The forward and backward pass of many equal perceptrons, written out.
 
 Autograd would do the same, slower. On a CPU each product goes to the faster of PyTorch's two libraries: oneDNN, which
-also applies the activation on its way, or what `@` calls (`make bench` compares them). Only the gradients that are asked
-for are computed. On a GPU all perceptrons are one batched product a layer.
+also applies the activation on its way, or what `@` calls (`make bench` compares them). Only gradients that somebody
+asks for are computed. On a GPU all perceptrons are one batched product a layer.
 
     x [nets, batch, in],  flat [nets, P] = W0 [in, h] | b0 [h] | W1 [h, h] | b1 [h] | ... | 0  ->  [nets, batch, out]
 """
