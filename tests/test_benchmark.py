@@ -119,7 +119,7 @@ def test_a_finished_grid_is_left_alone(grid: str, home: Path, capsys: pytest.Cap
     assert {run.folder: run.policy_path.stat().st_mtime_ns for run in runs} == before
     said = capsys.readouterr().out
     assert "4 runs, 0 to train" in said
-    assert "td3_bc" in said.splitlines()[-1]
+    assert "bdb" in said.splitlines()[-1]  # the paper's order: td3_bc, cql, bdb
 
 
 def test_the_table_is_of_the_grids_runs(grid: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:

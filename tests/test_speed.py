@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from tests.speed import profile
 from tests.speed.__main__ import environment, line
 from tests.speed.rows import side
 from tests.speed.side import Side
@@ -31,6 +32,14 @@ def test_a_side_works_for_about_as_long_as_it_is_told(name: str) -> None:
         assert 50 < working.memory < 5000
     finally:
         working.close()
+
+
+@pytest.mark.slow
+def test_a_profile_adds_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(profile, "ROUNDS", 1)
+    for parts in (profile.recording(), profile.cql()):
+        assert all(0 < value < 10_000 for value in parts.values()), parts
+    assert [row[-1] for row in profile.rows("x", "ms", {"one": 3.0, "other": 1.0})] == ["75%", "25%"]
 
 
 def test_a_row_that_misses_its_target_says_so() -> None:

@@ -6,5 +6,6 @@ peer.py        d3rlpy's sides, run by an interpreter of their own environment (o
 arithmetic.py  the matrix products of an update, counted by hand
 rows.py        which sides make which row, and what is expected
 gpu.py         a stack on a GPU against one run, in slices that resume
+profile.py     where the time goes, of what misses its target
 __main__.py    runs the rows and writes docs/benchmarks-KIND.md, KIND the processor's vector instructions
 """
