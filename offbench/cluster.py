@@ -108,11 +108,10 @@ class RayExecutor:
         return problems
 
     def _start(self, job: Job, place: int, token: str) -> Any:
-        ends = [end for end in (job.schedule.deadline, time.time() + self.slice) if end is not None]
-        sliced = replace(job, orders=left(job), schedule=replace(job.schedule, deadline=min(ends)))
         gpu = {"num_gpus": 1} if job.schedule.device != "cpu" else {}
         task = self.ray.remote(**self._retried, **gpu)(_train)
-        return task.remote(sliced, place, str(dataset.root().resolve()), token, self.shelf)
+        rest = replace(job, orders=left(job))
+        return task.remote(rest, self.slice, place, str(dataset.root().resolve()), token, self.shelf)
 
     def _result(self, ref: Any, job: Job) -> tuple[bool, list[str]]:
         try:
@@ -231,8 +230,10 @@ def _restore(environment: dict[str, str | None]) -> None:
             os.environ[key] = value
 
 
-def _train(job: Job, place: int, datasets: str, token: str, shelf: Any) -> tuple[bool, list[str]]:
-    """A task: train a stack until its slice ends."""
+def _train(job: Job, seconds: float, place: int, datasets: str, token: str, shelf: Any) -> tuple[bool, list[str]]:
+    """A task: train a stack until its slice ends, which begins here: however long it has waited, it goes on."""
+    ends = [end for end in (job.schedule.deadline, time.time() + seconds) if end is not None]
+    job = replace(job, schedule=replace(job.schedule, deadline=min(ends)))
 
     def report(step: int, note: str) -> None:
         shelf.report.remote(place, step, note)

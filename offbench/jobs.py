@@ -211,7 +211,8 @@ def _spread(jobs: Sequence[Job], processes: int, pool: _Pool, board: Board) -> I
             place, job = waiting.popleft()
             if not is_over(job):
                 pool.start(place, job)
-        for ready in wait(list(pool.active)):
+        # to wait for nothing, where all jobs that were left are over, is to wait for ever
+        for ready in wait(list(pool.active)) if pool.active else ():
             assert isinstance(ready, Connection)
             at_work = pool.active[ready][0]
             try:

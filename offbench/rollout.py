@@ -198,7 +198,7 @@ class Rollouts:
         self._pool: ProcessPoolExecutor | None = None
         if workers:
             context = multiprocessing.get_context("spawn")
-            self._closing = context.Event()
+            self._closing = context.RawValue("b", 0)  # no lock, which a killed worker could hold for ever
             self._pool = ProcessPoolExecutor(workers, context, start_worker, (os.getpid(), self._closing))
 
     def __enter__(self) -> Rollouts:
@@ -206,7 +206,7 @@ class Rollouts:
 
     def __exit__(self, *_: object) -> None:
         if self._pool:
-            self._closing.set()  # a second of episodes that nobody will look at
+            self._closing.value = 1  # a second of episodes that nobody will look at
             self._pool.shutdown(wait=True, cancel_futures=True)
 
     def submit(self, task: Task) -> Future[Any]:

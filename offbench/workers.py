@@ -59,14 +59,14 @@ def quiet_start() -> Iterator[None]:
 class _Here:
     """What a worker knows of its pool."""
 
-    closing: Any = None  # an event that the parent sets
+    closing: Any = None  # a shared number that the parent sets
 
 
 def start_worker(parent: int, closing: Any = None) -> None:
     """Leave Ctrl-C to the parent, and end when the parent is gone (even by kill -9).
 
     Args:
-        closing: an event: nothing that this worker is at is wanted any more.
+        closing: a shared number; when it is not 0, nothing that this worker is at is wanted any more.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
@@ -77,7 +77,7 @@ def start_worker(parent: int, closing: Any = None) -> None:
 
 def closing() -> bool:
     """Return whether nobody waits any more for what this worker is doing."""
-    return _Here.closing is not None and _Here.closing.is_set()
+    return _Here.closing is not None and bool(_Here.closing.value)
 
 
 def loaded(names: Sequence[str]) -> list[str]:

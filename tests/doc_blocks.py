@@ -46,6 +46,7 @@ REASONS = (
     "changes your shell",
     "downloads from another server",
 )
+LONGEST = 600.0  # seconds that a command may take: several times as long as any does
 FENCE = re.compile(
     r"(?:^<!-- (?P<note>.*?) -->\n)?^```(?P<language>\w*) ?(?P<info>.*)\n(?P<content>(?s:.*?))^```$", re.M
 )
@@ -127,9 +128,16 @@ def run_page(page: Path, home: Path, python: Path) -> int:
 
 def _run(command: list[str], home: Path, environment: dict[str, str]) -> None:
     begun = time.monotonic()
-    done = subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True, check=False)
+    environment = environment | {"PYTHONFAULTHANDLER": "1"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, cwd=home, env=environment, text=True, **pipes) as process:  # type: ignore[call-overload]
+        try:
+            output, errors = process.communicate(timeout=LONGEST)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGABRT)  # Python says where it hangs
+            output, errors = process.communicate(timeout=60)
     shown = command[-1] if command[0] == "bash" else (home / "script.py").read_text()
-    assert done.returncode == 0, f"{shown}\n{done.stdout}\n{done.stderr}"
+    assert process.returncode == 0, f"{shown}\n{output}\n{errors}"
     print(f"{time.monotonic() - begun:6.1f} s  {shown.splitlines()[0]}")
 
 

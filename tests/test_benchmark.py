@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from offbench.tables import score_runs
 from tests.made_runs import made_run
 from tests.speed.arithmetic import ALGORITHMS
 
+Cli = Callable[..., subprocess.CompletedProcess[str]]
 GRID = """
 datasets = ["DATASET"]
 seeds = 2
@@ -142,6 +144,12 @@ def test_missing_datasets_are_recorded_first(home: Path) -> None:
 def test_a_budget_stops_cleanly_and_the_same_call_goes_on(grid: str) -> None:
     assert not benchmark(prepare(grid, workers=1), budget="0.001s", say=silent)
     assert benchmark(prepare(grid, workers=1), budget="1h", say=silent)
+
+
+def test_a_budget_that_ends_before_any_training_begins_ends_the_command(grid: str, offbench_cli: Cli) -> None:
+    done = offbench_cli("benchmark", grid, "--budget", "0.001s", "--workers", "2", timeout=100)
+    assert done.returncode == 0, done.stderr
+    assert "the same command goes on" in done.stderr
 
 
 def test_a_budget_that_ends_before_any_evaluation_is_no_error(grid: str, capsys: pytest.CaptureFixture[str]) -> None:

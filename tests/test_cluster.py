@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,8 +16,11 @@ from offbench import cluster
 from offbench.benchmarking import benchmark
 from offbench.errors import OffbenchError
 from offbench.grid import load_grid
+from offbench.jobs import Order
 from offbench.planning import prepare
 from offbench.runs import Run, find_runs
+from offbench.stacking import cut, pending
+from offbench.training import Schedule
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
 
@@ -70,22 +74,35 @@ def test_a_lost_node_changes_nothing(two_nodes: Any, home: Path) -> None:
     """Slices of two seconds; a node is killed while both are at work, and another one joins."""
     nodes, workers = two_nodes
     assert run("local", None)
-    killed: list[float] = []
-
-    def kill() -> None:
-        while not any((home / "ray").rglob("checkpoint-*")):
+    executor = cluster.RayExecutor(nodes.address, slice_seconds=2)
+    with ThreadPoolExecutor(1) as beside:  # Ray starts and ends its nodes in the main thread alone
+        over = beside.submit(run, "ray", executor)
+        while not any((home / "ray").rglob("checkpoint-*")) and not over.done():
             time.sleep(0.1)
+        assert not over.done()
         nodes.remove_node(workers[0], allow_graceful=False)
-        killed.append(time.monotonic())
-        nodes.add_node(num_cpus=1)
-
-    thread = threading.Thread(target=kill)
-    thread.start()
-    assert run("ray", cluster.RayExecutor(nodes.address, slice_seconds=2))
-    ended = time.monotonic()
-    thread.join()
-    assert killed[0] < ended
+        nodes.add_node(num_cpus=1, wait=False)
+        assert over.result()
+    nodes.wait_for_nodes(60)  # the one that joined among them
+    assert len(nodes.list_all_nodes()) == 3
     same(home, "local", "ray")
+
+
+def test_a_slice_begins_when_its_task_does(home: Path, medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task dealt out a minute ago, with slices of half a minute, trains to its end all the same."""
+    held = SimpleNamespace(remote=lambda **_: lambda task: SimpleNamespace(remote=lambda *words: (task, words)))
+    executor = object.__new__(cluster.RayExecutor)
+    executor.ray, executor.slice, executor._retried = held, 30.0, {}
+    executor.shelf = SimpleNamespace(report=SimpleNamespace(remote=lambda *_: None))
+    order = Order("td3_bc", medium, {"hidden": (16, 16)}, 0, str(home / "runs" / medium / "td3_bc/default/seed-0"))
+    schedule = Schedule(1_000, 1_000, 1, "cpu", workers=0)
+    (job,) = pending(cut([order], "cpu", 1, 1)[0], schedule)
+    with cluster._token(home) as token:
+        with monkeypatch.context() as patched:
+            patched.setattr(cluster, "time", SimpleNamespace(time=lambda: time.time() - 60))
+            task, words = executor._start(job, 0, token)
+        assert task(*words) == (True, [])
+    assert not cluster.left(job)
 
 
 def test_nodes_that_share_no_disk_fetch_and_bring_back(
