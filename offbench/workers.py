@@ -40,20 +40,39 @@ def quiet_start() -> Iterator[None]:
     is hidden: a spawned process would run it again, and a worker needs nothing of it. A worker gets one thread for
     its matrix products: as many threads as cores in each of as many workers made recording several times slower.
     """
-    masks = hasattr(signal, "pthread_sigmask")
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS) if masks else set()
     script = sys.modules["__main__"]
-    sys.modules["__main__"] = types.ModuleType("__main__")
     threads = {name: "1" for name in THREADS if name not in os.environ}
-    os.environ |= threads
+    with _held_back():
+        sys.modules["__main__"] = types.ModuleType("__main__")
+        os.environ |= threads
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = script
+            for name in threads:
+                del os.environ[name]
+
+
+@contextlib.contextmanager
+def _held_back() -> Iterator[None]:
+    """Hold back Ctrl-C and SIGTERM, and let them come at the end.
+
+    The mask is for the process that starts, which inherits it. Here it is not enough: another thread, of a library's
+    say, may take the signal, and Python's handler runs in the main thread all the same.
+    """
+    masks, came = hasattr(signal, "pthread_sigmask"), list[int]()
+    here = threading.current_thread() is threading.main_thread()  # only this one may set handlers
+    handlers = {stop: signal.signal(stop, lambda number, _: came.append(number)) for stop in STOPS} if here else {}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS) if masks else set()
     try:
         yield
     finally:
-        sys.modules["__main__"] = script
-        for name in threads:
-            del os.environ[name]
+        for stop, handler in handlers.items():
+            signal.signal(stop, signal.SIG_DFL if handler is None else handler)
         if masks:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if came:
+            signal.raise_signal(came[0])
 
 
 class _Here:

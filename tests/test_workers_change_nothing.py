@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import CancelledError
 from pathlib import Path
@@ -24,6 +25,7 @@ from offbench.policy import uniform
 from offbench.record import cut_at
 from offbench.rollout import LANES, Episode, Rollouts, Task, play, result
 from offbench.seeds import Purpose
+from offbench.workers import quiet_start
 
 BOUNDS = np.full(3, -1, np.float32), np.full(3, 1, np.float32)
 
@@ -168,6 +170,29 @@ def test_leaving_the_pool_ends_what_is_being_played() -> None:
         while not future.running():
             time.sleep(0.01)
     assert isinstance(future.exception(timeout=0), CancelledError)
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_that_another_thread_takes_waits_until_a_worker_has_started(stop: signal.Signals) -> None:
+    release, started = threading.Event(), list[bool]()
+    other = threading.Thread(target=release.wait)
+    before = signal.signal(stop, signal.default_int_handler)
+
+    def start() -> None:
+        with quiet_start():
+            os.kill(os.getpid(), stop)
+            time.sleep(0.2)
+            started.append(True)
+
+    other.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            start()
+    finally:
+        signal.signal(stop, before)
+        release.set()
+        other.join()
+    assert started
 
 
 @pytest.mark.slow
