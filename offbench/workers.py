@@ -61,14 +61,15 @@ def _held_back() -> Iterator[None]:
     say, may take the signal, and Python's handler runs in the main thread all the same.
     """
     masks, came = hasattr(signal, "pthread_sigmask"), list[int]()
-    here = threading.current_thread() is threading.main_thread()  # only this one may set handlers
-    handlers = {stop: signal.signal(stop, lambda number, _: came.append(number)) for stop in STOPS} if here else {}
+    ours = STOPS if threading.current_thread() is threading.main_thread() else ()  # only this one may set handlers
+    known = [stop for stop in ours if signal.getsignal(stop) is not None]  # None: not Python's, no way to put it back
+    handlers = {stop: signal.signal(stop, lambda number, _: came.append(number)) for stop in known}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS) if masks else set()
     try:
         yield
     finally:
         for stop, handler in handlers.items():
-            signal.signal(stop, signal.SIG_DFL if handler is None else handler)
+            signal.signal(stop, handler)
         if masks:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         if came:

@@ -129,8 +129,9 @@ def run_page(page: Path, home: Path, python: Path) -> int:
 def _run(command: list[str], home: Path, environment: dict[str, str]) -> None:
     begun = time.monotonic()
     environment = environment | {"PYTHONFAULTHANDLER": "1"}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, cwd=home, env=environment, text=True, **pipes) as process:  # type: ignore[call-overload]
+    with subprocess.Popen(
+        command, cwd=home, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         try:
             output, errors = process.communicate(timeout=LONGEST)
         except subprocess.TimeoutExpired:
