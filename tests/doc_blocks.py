@@ -38,7 +38,7 @@ REASONS = (
     "needs a GPU",
     "takes days",
     "takes an hour",
-    "takes an hour or two",
+    "takes two or three hours",
     "needs d3rlpy's environment and the runs above",
     "needs a renderer",
     "needs D4RL's files",
