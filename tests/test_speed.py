@@ -5,12 +5,13 @@ from __future__ import annotations
 import platform
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from tests.speed import profile
 from tests.speed.__main__ import environment, line
-from tests.speed.rows import side
+from tests.speed.rows import peer, side
 from tests.speed.side import Side
 
 # d3rlpy's and the recording ones are left to `make bench` itself: they need an environment of their own, and minutes
@@ -40,6 +41,15 @@ def test_a_profile_adds_up(monkeypatch: pytest.MonkeyPatch) -> None:
     for parts in (profile.recording(), profile.cql()):
         assert all(0 < value < 10_000 for value in parts.values()), parts
     assert [row[-1] for row in profile.rows("x", "ms", {"one": 3.0, "other": 1.0})] == ["75%", "25%"]
+
+
+def test_d3rlpys_side_has_the_standard_librarys_modules(tmp_path: Path) -> None:
+    """Ours of the same names (profile) do not hide them, from any folder."""
+    (tmp_path / "d3rlpy.py").write_text("import cProfile\nprint(cProfile.__doc__)\nraise SystemExit(7)\n")
+    paths = f"{tmp_path}:{environment()['PYTHONPATH']}"
+    command = [sys.executable, *peer("td3_bc")[1:]]
+    done = subprocess.run(command, env=environment() | {"PYTHONPATH": paths}, capture_output=True, check=False)
+    assert done.returncode == 7, done.stderr
 
 
 def test_a_row_that_misses_its_target_says_so() -> None:

@@ -1,13 +1,14 @@
-"""d3rlpy's sides, for the interpreter of its own environment: `python peer.py NAME`. It imports no offbench."""
+"""d3rlpy's sides, for the interpreter of its own environment: `python -m tests.speed.peer NAME`.
+
+It imports no offbench. A module of the package, not a script, whose folder would come before the standard library.
+"""
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent))
-from side import Work, serve  # type: ignore[import-not-found]
+from tests.speed.side import Work, serve
 
 ROWS = 100_000
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from offbench.workers import cores
 
-HERE = Path(__file__).parent
-PEER = HERE.parent.parent / ".venv-d3rlpy" / "bin" / "python"
+PEER = Path(__file__).parent.parent.parent / ".venv-d3rlpy" / "bin" / "python"
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ def side(which: str, **arguments: object) -> tuple[str, ...]:
 
 def peer(algorithm: str) -> tuple[str, ...]:
     """Return the command of one of d3rlpy's sides."""
-    return (str(PEER), str(HERE / "peer.py"), "update", f"algorithm={algorithm}")
+    return (str(PEER), "-m", "tests.speed.peer", "update", f"algorithm={algorithm}")
 
 
 def rows(dataset: str) -> list[Row]:
