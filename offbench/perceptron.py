@@ -24,6 +24,9 @@ WIDE: bool = torch.backends.cpu.get_cpu_capability().startswith("AVX512")
 # Multiplications of a product below which a call of oneDNN costs more than it saves.
 WORTH_IT, WORTH_IT_WHEN_NARROW = 2**17, 2**21
 FEW_COLUMNS = 8
+# On a CPU a long batch goes through the layers in blocks that stay in the cache from one operation to the next: of so
+# many numbers a layer, but of no fewer rows than pay for a block's own overhead.
+BLOCK, BLOCK_ROWS = 2**19, 1024
 Layer = tuple[Tensor, Tensor]  # weight [.., in, out], bias [.., out]
 HAS_ONEDNN: bool = torch._C._has_mkldnn and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
@@ -36,6 +39,9 @@ def perceptrons(flat: Tensor, x: Tensor, sizes: Sequence[int], activation: str) 
         x: inputs [nets, batch, in].
         activation: of the hidden layers, relu or tanh.
     """
+    rows = max(BLOCK // max(sizes), BLOCK_ROWS)
+    if x.shape[1] > rows and not _batched(x):
+        return torch.cat([perceptrons(flat, block, sizes, activation) for block in torch.split(x, rows, 1)], 1)
     if torch.is_grad_enabled() and (flat.requires_grad or x.requires_grad):
         found: Tensor = _Perceptrons.apply(flat, x, tuple(sizes), activation)  # type: ignore[no-untyped-call]
         return found

@@ -42,7 +42,9 @@ def made(sizes: Sequence[int], batch: int, nets: int) -> tuple[Tensor, Tensor, T
     )
 
 
-@pytest.mark.parametrize("way", ["as on a GPU", "one by one", "one by one with AVX-512", "one by one with AVX2"])
+@pytest.mark.parametrize(
+    "way", ["as on a GPU", "one by one", "in blocks", "one by one with AVX-512", "one by one with AVX2"]
+)
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("nets", [1, 3])
 @pytest.mark.parametrize(("sizes", "batch"), [SMALL, LARGE, FEW])
@@ -52,6 +54,9 @@ def test_outputs_and_gradients_are_autograds(
     monkeypatch.setattr(perceptron, "HAS_ONEDNN", perceptron.HAS_ONEDNN and "AVX" in way)
     monkeypatch.setattr(perceptron, "WIDE", way.endswith("AVX-512"))
     monkeypatch.setattr(perceptron, "_batched", lambda _: way == "as on a GPU")
+    if way == "in blocks":
+        monkeypatch.setattr(perceptron, "BLOCK_ROWS", batch // 2 - 1)  # two and a bit
+        monkeypatch.setattr(perceptron, "BLOCK", 0)
     flat, x, grad = (part.requires_grad_() for part in made(sizes, batch, nets))
     wanted = reference(flat, x, sizes, activation)
     wanted_grads = torch.autograd.grad(wanted, [flat, x], grad)
