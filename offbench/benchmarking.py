@@ -95,6 +95,7 @@ def benchmark(
         for part, schedule in parts
         for job in pending(part, replace(schedule, deadline=deadline), tf32=bench.tf32, command=command)
     ]
+    jobs.sort(key=lambda job: job.work, reverse=True)  # a long one begun last would run beside idle ones
     if bench.device != "cpu":
         jobs = with_evaluators(jobs, bench.workers)
     for line in diverged([part for part, _ in parts]):  # known since an earlier call, which failed for it

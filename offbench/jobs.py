@@ -88,6 +88,11 @@ class Job:
         return len(self.orders) * self.schedule.steps
 
     @property
+    def work(self) -> float:
+        """What its updates cost, all runs together, beside the other jobs."""
+        return self.updates * self.cost
+
+    @property
     def title(self) -> str:
         """What a progress bar calls it."""
         first, runs = self.orders[0], len(self.orders)
@@ -138,8 +143,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         self.jobs, self.steps = jobs, dict[int, int]()
         runs = sum(len(job.orders) for job in jobs)
         title = jobs[0].title if len(jobs) == 1 else f"{runs} runs"
-        work = sum(job.updates * job.cost for job in jobs)
-        self.progress = Progress(sum(job.updates for job in jobs), title, work=work)
+        self.progress = Progress(sum(job.updates for job in jobs), title, work=sum(job.work for job in jobs))
 
     def __exit__(self, *error: Any) -> None:
         self.progress.__exit__(*error)

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,12 @@ import pytest
 
 import offbench
 from offbench import dataset
-from offbench.benchmarking import benchmark, shared
+from offbench.benchmarking import LocalExecutor, benchmark, shared
 from offbench.calibrate import operations
 from offbench.cli import main
 from offbench.errors import OffbenchError
 from offbench.grid import load_grid, shipped_grids
+from offbench.jobs import Job
 from offbench.planning import Plan, prepare
 from offbench.recipes import load_recipe
 from offbench.registry import load_algorithm
@@ -155,6 +156,22 @@ def test_a_budget_that_ends_before_any_training_begins_ends_the_command(grid: st
 def test_a_budget_that_ends_before_any_evaluation_is_no_error(grid: str, capsys: pytest.CaptureFixture[str]) -> None:
     main(["benchmark", grid, "--budget", "0.001s", "--workers", "1"])
     assert "the same command goes on" in capsys.readouterr().err
+
+
+def test_the_longest_training_begins_first(grid: str, home: Path) -> None:
+    """The grid's BDB runs, last in the file, take a hundred times TD3+BC's updates."""
+    text = (home / "grid.toml").read_text()
+    (home / "grid.toml").write_text(text.replace("steps = 100\n", "steps = 20000\n"))
+    begun: list[int] = []
+
+    class Idle(LocalExecutor):
+        def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
+            begun.extend(job.schedule.steps for job in jobs)
+            return []
+
+    assert not benchmark(prepare(grid, workers=2), executor=Idle(), say=silent)
+    assert begun == sorted(begun, reverse=True)
+    assert set(begun) == {200, 20_000}
 
 
 def test_shards_share_the_runs_and_together_are_the_grid(grid: str, home: Path) -> None:
