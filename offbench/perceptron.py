@@ -22,7 +22,7 @@ from torch import Tensor
 # products with very few columns.
 WIDE: bool = torch.backends.cpu.get_cpu_capability().startswith("AVX512")
 # Multiplications of a product below which a call of oneDNN costs more than it saves.
-WORTH_IT, WORTH_IT_WHEN_NARROW = 2**17, 2**21
+WORTH_IT, WORTH_IT_WHEN_NARROW, WORTH_IT_WHEN_COPIED = 2**17, 2**21, 2**22
 FEW_COLUMNS = 8
 # On a CPU a long batch goes through the layers in blocks that stay in the cache from one operation to the next: of so
 # many numbers a layer, but of no fewer rows than pay for a block's own overhead.
@@ -138,8 +138,8 @@ def product(a: Tensor, b: Tensor, out: Tensor | None = None) -> Tensor:
 def _before(grad: Tensor, h: Tensor, activation: str) -> Tensor:
     """Turn the gradient of an activation's output h into that of its input, in place."""
     if activation == "relu":
-        return torch.ops.aten.threshold_backward(grad, h, 0, grad_input=grad)  # type: ignore[no-any-return]
-    return torch.ops.aten.tanh_backward(grad, h, grad_input=grad)  # type: ignore[no-any-return]
+        return torch.ops.aten.threshold_backward.grad_input(grad, h, 0, grad_input=grad)  # type: ignore[no-any-return]
+    return torch.ops.aten.tanh_backward.grad_input(grad, h, grad_input=grad)  # type: ignore[no-any-return]
 
 
 def _onednn(a: Tensor, b: Tensor) -> bool:
@@ -148,10 +148,12 @@ def _onednn(a: Tensor, b: Tensor) -> bool:
     (m, k), n = a.shape, b.shape[1]
     if n == 1 or (n > FEW_COLUMNS and not WIDE):
         return False
+    if n > FEW_COLUMNS and not a.is_contiguous():  # the gradients of weights: PyTorch turns `a` round for oneDNN
+        return m * k * n >= WORTH_IT_WHEN_COPIED
     return m * k * n >= (WORTH_IT if k >= 64 else WORTH_IT_WHEN_NARROW)
 
 
 def _linear(a: Tensor, b: Tensor, bias: Tensor | None, activation: str) -> Tensor:
     """Return oneDNN's activation(a @ b.T + bias) of one network: the operation that PyTorch's own compiler calls."""
-    found: Tensor = torch.ops.mkldnn._linear_pointwise(a, b, bias, activation, [], "")
+    found: Tensor = torch.ops.mkldnn._linear_pointwise.default(a, b, bias, activation, [], "")
     return found

@@ -94,12 +94,19 @@ def test_one_of_many_is_the_same_as_alone() -> None:
         assert torch.equal(together[place : place + 1], alone)
 
 
-@pytest.mark.parametrize(("wide", "wanted"), [(True, [True, True, False]), (False, [False, True, False])])
+@pytest.mark.parametrize(
+    ("wide", "wanted"), [(True, [True, True, False, True, False]), (False, [False, True, False, False, False])]
+)
 def test_the_library_follows_from_processor_and_shape(
     wide: bool, wanted: list[bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Large, few columns, a single column; never from the clock, or a run would not be the same twice."""
+    """Large, few columns, a single column; never from the clock, or a run would not be the same twice.
+
+    And gradients of weights, a large and a small one, whose first factor is turned round: oneDNN would copy it.
+    """
     monkeypatch.setattr(perceptron, "HAS_ONEDNN", True)
     monkeypatch.setattr(perceptron, "WIDE", wide)
     shapes = [((256, 256), (256, 256)), ((256, 256), (256, 3)), ((256, 256), (256, 1))]
-    assert [perceptron._onednn(torch.zeros(a), torch.zeros(b)) for a, b in shapes] == wanted
+    pairs = [(torch.zeros(a), torch.zeros(b)) for a, b in shapes]
+    pairs += [(torch.zeros(256, i).mT, torch.zeros(256, 256)) for i in (256, 14)]
+    assert [perceptron._onednn(a, b) for a, b in pairs] == wanted
