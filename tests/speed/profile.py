@@ -1,4 +1,4 @@
-"""Where the time of a recording and of CQL's update goes: `python -m tests.speed.profile`, with nothing else running.
+"""Where the time of a recording and of an update goes: `python -m tests.speed.profile`, with nothing else running.
 
 Writes docs/results/profile-KIND.md, KIND the processor's vector instructions. One process of one thread.
 """
@@ -10,8 +10,9 @@ from collections.abc import Callable
 from typing import Any
 
 import mujoco
+import pytest
 
-from offbench import perceptron
+from offbench import networks, perceptron
 from offbench.environments import make_env
 from offbench.files import write_bytes
 from offbench.ladder import read_ladder
@@ -23,6 +24,13 @@ from tests.speed.__main__ import DOCS
 from tests.speed.sides import ENV, train
 
 ROUNDS = 5  # the least of so many is taken: whatever disturbs adds to it
+PRODUCTS, OPTIMISER = "matrix products, biases and activations of the forward passes", "Adam and Polyak averaging"
+WATCHED = [
+    (perceptron, "affine", PRODUCTS),
+    (perceptron, "product", PRODUCTS),
+    (networks.Learned, "descend", OPTIMISER),
+    (networks.Target, "follow", OPTIMISER),
+]
 
 
 def recording() -> dict[str, float]:
@@ -67,46 +75,48 @@ def recording() -> dict[str, float]:
     }
 
 
-def cql() -> dict[str, float]:
-    """Return milliseconds of an update (2-layer networks): in matrix products, and in all else."""
-    spent = [0.0]
+def update(algorithm: str) -> dict[str, float]:
+    """Return milliseconds of an update (2-layer networks): in matrix products, in the optimiser, and in all else."""
+    spent: dict[str, float] = {}
 
-    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+    def timed(owner: Any, name: str, part: str) -> Callable[..., Any]:
+        function = getattr(owner, name)
+
         def call(*arguments: Any, **named: Any) -> Any:
             began = time.perf_counter()
             found = function(*arguments, **named)
-            spent[0] += time.perf_counter() - began
+            spent[part] += time.perf_counter() - began
             return found
 
         return call
 
-    work = train("cql", hidden="256,256")
-    kept = perceptron.affine, perceptron.product
-    perceptron.affine, perceptron.product = map(timed, kept)
-    try:
+    work = train(algorithm, hidden="256,256")
+    with pytest.MonkeyPatch.context() as patch:
+        for owner, name, part in WATCHED:
+            patch.setattr(owner, name, timed(owner, name, part))
         found = []
         for _ in range(ROUNDS):
-            spent[0], began = 0.0, time.perf_counter()
+            spent = dict.fromkeys((part for _, _, part in WATCHED), 0.0)
+            began = time.perf_counter()
             updates = work()
-            found.append((1e3 * (time.perf_counter() - began) / updates, 1e3 * spent[0] / updates))
-    finally:
-        perceptron.affine, perceptron.product = kept
-    everything, products = min(found)
-    return {
-        "matrix products, biases and activations of the forward passes": products,
-        "all else": everything - products,
-    }
+            whole = 1e3 * (time.perf_counter() - began) / updates
+            found.append((whole, {part: 1e3 * seconds / updates for part, seconds in spent.items()}))
+    everything, parts = min(found, key=lambda pair: pair[0])
+    rest = "all else: losses, gradients of activations, sampling, overhead of small operations"
+    return parts | {rest: everything - sum(parts.values())}
 
 
 def rows(what: str, unit: str, parts: dict[str, float]) -> list[list[str]]:
     """Return the parts as rows of a table, with their shares."""
     whole = sum(parts.values())
-    return [[what, name, f"{value:.1f} {unit}", f"{100 * value / whole:.0f}%"] for name, value in parts.items()]
+    return [[what, name, f"{value:.2f} {unit}", f"{100 * value / whole:.0f}%"] for name, value in parts.items()]
 
 
 def main() -> None:
     """Measure, print and write."""
-    found = rows("a recorded step of hopper, medium", "µs", recording()) + rows("an update of cql", "ms", cql())
+    found = rows("a recorded step of hopper, medium", "µs", recording())
+    for algorithm in ("td3_bc", "bdb", "cql"):
+        found += rows(f"an update of {algorithm}", "ms", update(algorithm))
     text = "\n".join(markdown(["of", "part", "takes", "share"], found)) + "\n"
     print(text)
     write_bytes(DOCS / "results" / f"profile-{hardware()['hardware']['vectors'].lower()}.md", text.encode())
