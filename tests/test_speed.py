@@ -78,6 +78,6 @@ with arithmetic("cpu", tf32=False):
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library's memory is its own affair")
 def test_a_training_keeps_the_memory_that_an_update_frees() -> None:
-    """64 MB are 16,384 pages: few of them are asked for again."""
+    """64 MB are 16,384 pages: ten updates ask for less than half of one, whatever lies where."""
     found = subprocess.run([sys.executable, "-c", FAULTS], check=True, capture_output=True, text=True)
-    assert int(found.stdout) < 4000
+    assert int(found.stdout) < 8_192
