@@ -11,7 +11,7 @@ from typing import Any
 
 from offbench.errors import OffbenchError, unknown
 from offbench.registry import algorithm_names
-from offbench.results import REFERENCES, Entry, Results, Task, Trained, read_results
+from offbench.results import REFERENCES, Entry, Results, Task, Trained, read_results, window_words
 from offbench.statistics import Estimate, Paired, improvement, paired
 from offbench.wording import counted
 
@@ -39,7 +39,8 @@ class Comparison:
         statistics: difference of A - B.
         chance: probability that a run of A scores above one of B, over the paired runs.
         unpaired: how many runs of either have no partner and are left out.
-        steps: how far A's and B's paired runs have been evaluated.
+        windows: which evaluations are behind the scores of A's and of B's paired runs, in words.
+        comparable: whether both runs of each pair are scored over evaluations at the same steps.
         unfinished: how many of the paired runs have not reached their last step, or have diverged.
     """
 
@@ -50,7 +51,8 @@ class Comparison:
     statistics: Paired
     chance: Estimate
     unpaired: int
-    steps: tuple[list[int], ...]
+    windows: tuple[str, str]
+    comparable: bool
     unfinished: int
 
     @property
@@ -61,6 +63,8 @@ class Comparison:
         over = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
         over += " seed" if counts[-1] == 1 else " seeds"
         over += f" on {len(sizes)} datasets" if len(sizes) > 1 else ""
+        if not self.comparable:
+            return "no verdict: the scores are of evaluations at different steps"
         sign = favoured(self.statistics)
         if not sign:
             return f"no evidence of a difference at {over}"
@@ -80,9 +84,11 @@ class Comparison:
             f"probability of improvement  {percent.value:.0f}% {percent.span()}".rstrip(),
             f"sign-flip test              p = {found.p:.3g}",
         ]
-        if self.steps[0] != self.steps[1]:
-            told = [" to ".join(f"{step:,}" for step in dict.fromkeys((s[0], s[-1]))) for s in self.steps]
-            lines.append(f"note: not the same training: {self.a} {told[0]} steps, {self.b} {told[1]}")
+        if not self.comparable:
+            lines.append(
+                f"note: evaluated at different steps: {self.a} {self.windows[0]}; {self.b} {self.windows[1]}; train "
+                "both to the same --steps with the same --eval-every"
+            )
         if self.unfinished:
             lines.append(f"note: {self.unfinished} of the paired runs did not reach their last step")
         if self.unpaired:
@@ -120,6 +126,7 @@ class Comparison:
             "pairs": [dataclasses.asdict(pair) for pair in self.pairs],
             "unpaired": self.unpaired,
             "unfinished": self.unfinished,
+            "comparable": self.comparable,
             "verdict": self.verdict,
         }
 
@@ -158,7 +165,8 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
         paired(differences(both)),
         improvement(_by_dataset(pairs, lambda pair: pair.a), _by_dataset(pairs, lambda pair: pair.b)),
         sum(len(entry.runs) for group in groups for entry in group) - 2 * len(both),
-        tuple(sorted({t.reached for t in side}) for side in trained),
+        (window_words(trained[0]), window_words(trained[1])),
+        comparable(both),
         sum(t.state != "finished" for side in trained for t in side),
     )
 
@@ -171,6 +179,11 @@ def partners(a: Iterable[Entry], b: Iterable[Entry]) -> Partners:
     others = {(entry.task, trained.seed): trained for entry in b for trained in entry.runs}
     mine = ((entry.task, trained) for entry in a for trained in entry.runs)
     return [(task, one, others[task, one.seed]) for task, one in mine if (task, one.seed) in others]
+
+
+def comparable(both: Partners) -> bool:
+    """Return whether both runs of each pair are scored over evaluations at the same steps."""
+    return all(one.window == other.window for _, one, other in both)
 
 
 def differences(both: Partners) -> dict[str, list[float]]:

@@ -21,7 +21,8 @@ import numpy as np
 from offbench.errors import OffbenchError
 from offbench.levels import LEVELS
 from offbench.runs import DIGITS, Run, find_runs
-from offbench.scores import LAST, mean_std, normalize, run_return
+from offbench.scores import mean_std, normalize, run_return, window
+from offbench.wording import counted
 
 # the order of the BDB paper's Table 1; levels are in its order already
 ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
@@ -102,6 +103,11 @@ class Trained:
         return int(self.config["seed"])
 
     @property
+    def window(self) -> tuple[int, ...]:
+        """The steps of the evaluations behind the run's score."""
+        return window(self.evaluations)
+
+    @property
     def reached(self) -> int:
         """The newest evaluated step."""
         return max(self.evaluations)
@@ -168,7 +174,13 @@ class Entry:
     @property
     def evaluations(self) -> int:
         """The fewest evaluations behind a run's score."""
-        return min(min(len(trained.evaluations), LAST) for trained in self.runs)
+        return min(len(trained.window) for trained in self.runs)
+
+    @property
+    def window(self) -> tuple[int, ...] | None:
+        """The steps of the evaluations behind the scores; None if the runs differ."""
+        windows = {trained.window for trained in self.runs}
+        return windows.pop() if len(windows) == 1 else None
 
     def common_curve(self) -> tuple[list[int], np.ndarray[Any, Any]]:
         """Return the steps that all runs were evaluated at, and their scores [runs, steps]."""
@@ -191,6 +203,11 @@ class Results:
         """Return a method's entries in order of tasks."""
         return [self.entries[task, method] for task in self.tasks if (task, method) in self.entries]
 
+    def comparable(self, task: Task) -> bool:
+        """Return whether all scores of a task are of evaluations at the same steps: others must not be ranked."""
+        runs = [trained for (of, _), entry in self.entries.items() if of == task for trained in entry.runs]
+        return len({trained.window for trained in runs}) == 1
+
     def scores(self, method: Method) -> dict[str, list[float]]:
         """Return {task: normalised scores of its seeds}; tasks without a reference are left out."""
         return {entry.task.name: entry.scores for entry in self.of(method) if entry.task.reference}
@@ -208,6 +225,15 @@ def read_results(root: str | Path) -> Results:
     tasks = dict.fromkeys(entry.task for entry in entries)
     methods = sorted({entry.method for entry in entries}, key=_method_order)
     return Results(Path(root), tuple(tasks), tuple(methods), {(e.task, e.method): e for e in entries}, tuple(waiting))
+
+
+def window_words(runs: Iterable[Trained]) -> str:
+    """Return which evaluations are behind the scores of runs: `10 evaluations, steps 5,000 to 50,000`."""
+    windows = [trained.window for trained in runs]
+    fewest, most = (len(f(windows, key=len)) for f in (min, max))
+    count = counted(most, "evaluation") if fewest == most else f"{fewest} to {most} evaluations"
+    first, last = min(found[0] for found in windows), max(found[-1] for found in windows)
+    return f"{count}, " + (f"step {last:,}" if first == last else f"steps {first:,} to {last:,}")
 
 
 def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:

@@ -30,13 +30,18 @@ def normalize(value: float, low: float, high: float) -> float:
 LAST = 10  # evaluations behind a run's score
 
 
+def window(evaluations: Mapping[int, Sequence[tuple[float, int]]]) -> tuple[int, ...]:
+    """Return the steps of the evaluations behind a run's score: its last 10."""
+    return tuple(sorted(evaluations)[-LAST:])
+
+
 def run_return(evaluations: Mapping[int, Sequence[tuple[float, int]]]) -> float:
     """Return a run's mean return over its last 10 evaluations (never its best checkpoint).
 
     Args:
         evaluations: {step: [(return, length) of each episode]}.
     """
-    means = [np.mean([value for value, _ in evaluations[step]]) for step in sorted(evaluations)[-LAST:]]
+    means = [np.mean([value for value, _ in evaluations[step]]) for step in window(evaluations)]
     return float(np.mean(means))
 
 

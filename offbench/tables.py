@@ -29,7 +29,9 @@ def score_runs(runs: str | Path = "runs") -> list[Row]:
     A run's score is the mean of its last 10 evaluations; a row has the mean and the standard deviation over
     seeds, normalised by the dataset's own reference (`score`) and by D4RL's constants (`d4rl_score`), and the
     interquartile mean of `score` with its 95% bootstrap interval (`iqm`, in JSON and CSV). Only if one id stands for
-    several contents, rows have the first digits of the content's hash (`content`).
+    several contents, rows have the first digits of the content's hash (`content`). `window` (in JSON and CSV) has the
+    steps of the evaluations behind the scores, and is empty if they differ between seeds: only scores of one window
+    compare.
 
     Raises:
         OffbenchError: the folder holds no evaluated run, or a damaged one.
@@ -63,6 +65,7 @@ def _row(entry: Entry, twins: bool) -> Row:
         "steps": entry.reached,
         "of_steps": entry.steps,
         "evaluations": entry.evaluations,
+        "window": " ".join(map(str, entry.window)) if entry.window else None,
         "return": mean_return,
     }
     for column, reference in (("score", "dataset"), ("d4rl_score", "d4rl")):
@@ -119,6 +122,7 @@ def normalize_runs_or_returns(
 
 
 TITLES = {
+    "window": None,
     "of_steps": None,  # shown as 50,000/1,000,000 in the steps column
     "score": "score (own ref.)",
     "score_std": None,
@@ -143,14 +147,27 @@ def render(rows: Sequence[Row], style: str = "table") -> str:
     keys = [key for key in rows[0] if TITLES.get(key, key) is not None]
     header = [TITLES.get(key, key) or key for key in keys]
     cells = [[_cell(row, key, "$\\pm$" if style == "latex" else "±") for key in keys] for row in rows]
+    notes = _window_notes(rows)
     if style == "markdown":
-        return "\n".join(markdown(header, cells))
+        return "\n".join([*markdown(header, cells), *(line for note in notes for line in ("", note))])
     if style == "latex":
-        return _latex(header, cells)
+        return "\n".join([_latex(header, cells), *(f"% {note}" for note in notes)])
     widths = [max(len(line[i]) for line in [header, *cells]) for i in range(len(header))]
     lines = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in [header, *cells]]
     rule = ["-" * width for width in widths]
-    return "\n".join("  ".join(line).rstrip() for line in [lines[0], rule, *lines[1:]])
+    return "\n".join(["  ".join(line).rstrip() for line in [lines[0], rule, *lines[1:]]] + notes)
+
+
+def _window_notes(rows: Sequence[Row]) -> list[str]:
+    """Return a note if scores of one dataset are of evaluations at different steps."""
+    windows: dict[tuple[Any, Any], set[Any]] = {}
+    for row in rows:
+        if "window" in row:
+            windows.setdefault((row["dataset"], row.get("content")), set()).add(row["window"])
+    torn = sorted({dataset for (dataset, _), found in windows.items() if len(found) > 1 or None in found})
+    if not torn:
+        return []
+    return [f"note: scores of {', '.join(torn)} are of evaluations at different steps and cannot be compared"]
 
 
 def markdown(header: Sequence[str], cells: Sequence[Sequence[str]]) -> list[str]:

@@ -122,7 +122,8 @@ def test_a_finished_grid_is_left_alone(grid: str, home: Path, capsys: pytest.Cap
     assert {run.folder: run.policy_path.stat().st_mtime_ns for run in runs} == before
     said = capsys.readouterr().out
     assert "4 runs, 0 to train" in said
-    assert "bdb" in said.splitlines()[-1]  # the paper's order: td3_bc, cql, bdb
+    assert "bdb" in said.splitlines()[-2]  # the paper's order: td3_bc, cql, bdb
+    assert "different steps" in said.splitlines()[-1]  # 200 updates and 100
 
 
 def test_the_table_is_of_the_grids_runs(grid: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:

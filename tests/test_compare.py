@@ -88,7 +88,8 @@ def test_unequal_training_is_said(home: Path) -> None:
         run = made_run(home / "runs", "hopper-medium-v0", "cql", "default", seed, 0)
         run.write_evaluations({3000: [(40.0, 5)]})
     text = "\n".join(offbench.compare("td3_bc", "cql").lines())
-    assert "note: not the same training: td3_bc 30,000 steps, cql 3,000" in text
+    assert "evaluated at different steps: td3_bc 1 evaluation, step 30,000; cql 1 evaluation, step 3,000" in text
+    assert "no verdict" in text
     assert "note: 2 of the paired runs did not reach their last step" in text
 
 

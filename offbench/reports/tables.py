@@ -8,9 +8,9 @@ import importlib.resources
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from offbench.comparison import differences, favoured, partners
+from offbench.comparison import comparable, differences, favoured, partners
 from offbench.reports.layout import Cell, Table
-from offbench.results import REFERENCES, Entry, Method, Results, Task
+from offbench.results import REFERENCES, Entry, Method, Results, Task, window_words
 from offbench.runs import DIGITS
 from offbench.scores import LAST, mean_std
 from offbench.statistics import Estimate, Scores, improvement, iqm, paired
@@ -50,7 +50,7 @@ def score_table(results: Results) -> Table:
     rows = []
     for i, task in enumerate(results.tasks):
         env, level = task.place
-        cells = []
+        cells, ranked = [], results.comparable(task)
         for j, method in enumerate(results.methods):
             entry = results.entries.get((task, method))
             if entry is None:
@@ -58,11 +58,12 @@ def score_table(results: Results) -> Table:
                 continue
             more = [] if len(seeds) == 1 else [counted(len(entry.runs), "seed")]
             more += [] if steps[method] else [column_steps([entry])]
+            more += [] if ranked else [window_words(entry.runs)]
             number = paper.get((env, level, method.published))
             below = "" if number is None else f"paper {number:g}"
             cells.append(_score_cell(entry, below, cell_id(i, j), ", ".join(more)))
         below_row = "" if len({t.reference for t in results.tasks}) == 1 else REFERENCES[task.reference]
-        rows.append([*row_name(results, task, below_row), *_best(cells)])
+        rows.append([*row_name(results, task, below_row), *(_best(cells) if ranked else cells)])
     beside = any(cell.below for row in rows for cell in row[2:])
     return Table(
         "scores",
@@ -124,6 +125,11 @@ def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
         f"never its best ({last} of them here). {scale(results)} The best mean of a row is in bold; whether a "
         "difference is real, `offbench compare` says.",
     ]
+    if not all(results.comparable(task) for task in results.tasks):
+        notes.append(
+            "In a row whose cells name their evaluations, the scores are of evaluations at different steps: they "
+            "cannot be compared, and none is in bold."
+        )
     if beside:
         notes.append(f"“paper”: {PAPER} (5 seeds, 1M steps). {DIFFERENT_DATA}")
     states = set().union(*(entry.states for entry in entries))
@@ -214,8 +220,11 @@ def iqm_table(results: Results, found: Mapping[Method, tuple[Estimate, Scores]])
     ]
     if len({tuple(scores) for _, scores in found.values()}) > 1:
         notes.append("The methods were not run on the same tasks: their IQMs do not compare one with another.")
-    if len({entry.reached for entry in results.entries.values()}) > 1:
-        notes.append("Not all runs have trained for the same number of steps: the table of scores says how many.")
+    if not all(results.comparable(task) for task in results.tasks):
+        notes.append(
+            "On some tasks the scores are of evaluations at different steps (the table of scores says which): the "
+            "IQMs cannot be compared."
+        )
     header = ["method", "IQM", "95% low", "95% high", "tasks", "runs"]
     return Table("iqm", "Interquartile mean over tasks", header, rows, notes)
 
@@ -237,7 +246,8 @@ def improvement_table(results: Results, found: Mapping[Method, tuple[Estimate, S
         f"tasks that both have, with its 95% interval by stratified bootstrap. 50 is a draw. {FEW_SEEDS} An interval "
         "above 50 is therefore no evidence by itself. Bold: `offbench compare` finds the row's method better, as the "
         "interval of the paired difference and the sign-flip test agree. Each pair is tested by itself: of many "
-        "pairs of equal methods a few come out bold by chance.",
+        "pairs of equal methods a few come out bold by chance. A pair scored over evaluations at different steps is "
+        "not tested.",
     ]
     title = "Probability of improvement"
     return Table("improvement", title, ["row above column", *[method.label for method in methods]], rows, notes)
@@ -247,7 +257,7 @@ def _better(results: Results, a: Method, b: Method) -> bool:
     """Return whether `compare` finds A better, on the tasks that have scores."""
     groups = ([entry for entry in results.of(method) if entry.task.reference] for method in (a, b))
     both = partners(*groups)
-    return bool(both) and favoured(paired(differences(both))) > 0
+    return bool(both) and comparable(both) and favoured(paired(differences(both))) > 0
 
 
 def _chance(estimate: Estimate | None, better: bool) -> Cell:
@@ -274,7 +284,7 @@ def seed_table(results: Results) -> Table:
                     Cell(f"{score:.2f}", score) if entry.task.reference else NONE,
                     Cell(f"{ret:.2f}", ret),
                     Cell(REFERENCES[entry.task.reference]),
-                    Cell(str(min(len(trained.evaluations), LAST)), min(len(trained.evaluations), LAST)),
+                    Cell(str(len(trained.window)), len(trained.window)),
                     Cell(f"{trained.reached:,}", trained.reached),
                     Cell(f"{trained.steps:,}", trained.steps),
                     Cell(trained.state),
