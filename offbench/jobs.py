@@ -27,9 +27,9 @@ from offbench.progress import Progress
 from offbench.registry import load_algorithm
 from offbench.runs import Run
 from offbench.settings import build
-from offbench.training import Report, Schedule, Trainer
+from offbench.training import STOPPED, Report, Schedule, Trainer
 from offbench.transitions import Transitions
-from offbench.workers import quiet_start, start_worker
+from offbench.workers import announce_stop, quiet_start, start_worker
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,8 @@ def run_jobs(jobs: Sequence[Job], processes: int) -> list[str]:
     with Board(jobs) as board:
         if processes == 1 or len(jobs) == 1:
             return [line for i, job in enumerate(jobs) for line in _here(job, i, board)]
-        with _Pool() as pool:
-            return list(_spread(jobs, processes, pool, board))
+        with _Pool(board) as pool:
+            return list(_spread(jobs, processes, pool))
 
 
 def complain(problems: Sequence[str]) -> None:
@@ -149,10 +149,12 @@ class Board(contextlib.AbstractContextManager["Board"]):
         self.progress.__exit__(*error)
 
     def heard(self, job: int, step: int, note: str) -> None:
-        """Take in one of a job's reports, none of which is missed: the first says where it goes on."""
+        """Take in one of a job's reports, none of which is missed: they say where it goes on and where it stops."""
         if job not in self.steps and step:
             self.progress.say(f"{self.jobs[job].title}: going on from step {step:,}")
         self.at(job, step, note)
+        if note == STOPPED:
+            self.progress.say(f"{self.jobs[job].title}: stopped at step {step:,}, checkpoint saved")
 
     def at(self, job: int, step: int, note: str) -> None:
         """Take in that a job is at `step`."""
@@ -182,9 +184,10 @@ def is_over(job: Job) -> bool:
 
 
 class _Pool(contextlib.AbstractContextManager["_Pool"]):
-    """The processes at work; leaving the context ends them."""
+    """The processes at work; leaving the context ends them, each with a checkpoint."""
 
-    def __init__(self) -> None:
+    def __init__(self, board: Board) -> None:
+        self.board = board
         self.active: dict[Connection, tuple[int, multiprocessing.process.BaseProcess]] = {}
 
     def start(self, place: int, job: Job) -> None:
@@ -201,14 +204,25 @@ class _Pool(contextlib.AbstractContextManager["_Pool"]):
         pipe.close()
         process.join()
 
-    def __exit__(self, *_error: object) -> None:
-        for _, process in self.active.values():
+    def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
+        at_work = [process for _, process in self.active.values()]
+        for process in at_work:
             process.terminate()
-        for pipe in list(self.active):
-            self.end(pipe)
+        if kind is KeyboardInterrupt:
+            announce_stop()
+        try:
+            for pipe, (place, _) in list(self.active.items()):
+                with contextlib.suppress(EOFError, OSError):  # it has ended
+                    while (heard := pipe.recv())[0] is not None:
+                        self.board.heard(place, *heard[:2])
+                self.end(pipe)
+        except KeyboardInterrupt:
+            for process in at_work:
+                process.kill()
+            raise
 
 
-def _spread(jobs: Sequence[Job], processes: int, pool: _Pool, board: Board) -> Iterator[str]:
+def _spread(jobs: Sequence[Job], processes: int, pool: _Pool) -> Iterator[str]:
     waiting = collections.deque(enumerate(jobs))
     while waiting or pool.active:
         while waiting and len(pool.active) < processes:
@@ -225,7 +239,7 @@ def _spread(jobs: Sequence[Job], processes: int, pool: _Pool, board: Board) -> I
                 step, note = None, ""
                 lines = [f"a training process died (killed, or out of memory): {jobs[at_work].title}"]
             if step is not None:
-                board.heard(at_work, step, note)
+                pool.board.heard(at_work, step, note)
                 continue
             yield from lines
             pool.end(ready)

@@ -1,7 +1,7 @@
 """The training loop: a stack of runs, from its members to their checkpoints and evaluations.
 
 every eval_every steps:  checkpoint, then evaluate a snapshot on worker processes while training goes on
-a deadline:              stops at the next chunk with a checkpoint; the same command goes on from there
+a deadline, or Ctrl-C:   stops at the next chunk with a checkpoint; the same command goes on from there
 a run that diverges:     is left out from there on and marked; the others go on, they share nothing with it
 """
 
@@ -29,10 +29,13 @@ from offbench.runs import Run
 from offbench.scores import normalize
 from offbench.seeds import Purpose
 from offbench.stack import Stack, slice_of
+from offbench.workers import stops_noted
 
 LOG_EVERY = 1000  # updates behind a row of losses.csv
 QUICK = 1.0  # seconds; checkpoints that take longer are not written at every evaluation
 SHARE = 0.05  # of the time that slow checkpoints may take
+
+STOPPED = "stopped with a checkpoint"  # the last note of a training that was interrupted
 
 Report = Callable[[int, str], None]  # takes the step and a note such as the last score
 
@@ -75,6 +78,7 @@ class Trainer:
         self.rollouts: Rollouts | None = None
         self.note = ""
         self.lost: dict[int, str] = {}  # runs that have diverged, and how
+        self.stops: list[int] = []  # Ctrl-C and SIGTERM, as they came
         self._saved, self._took = time.monotonic(), 0.0  # when the last checkpoint was written, and how long it took
 
     def train(self, report: Report) -> list[str]:
@@ -82,8 +86,12 @@ class Trainer:
 
         Returns:
             A line for each run that has diverged.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C came, or whatever SIGTERM does, once a checkpoint is written.
         """
         with contextlib.ExitStack() as resources:
+            self.stops = resources.enter_context(stops_noted(second_at_once=True))
             for member in self.members:
                 resources.enter_context(held(member.run))
             self._resume()
@@ -100,7 +108,7 @@ class Trainer:
                 in_time = self._train_to(self._next_stop(), report)
                 self._mark_diverged()
                 self._collect()  # evaluations of earlier steps land first, so a resume misses none
-                if not in_time or self.stack.step == self.schedule.steps or self._has_time():
+                if self.stack.step and (not in_time or self.stack.step == self.schedule.steps or self._has_time()):
                     self._checkpoint()
                 if not in_time:
                     break
@@ -108,11 +116,14 @@ class Trainer:
                     self._evaluate()
             self._collect()
             self._show()
-            report(self.stack.step, self.note)
+            saved = self.stops and self.stack.step and any(self._going())
+            report(self.stack.step, STOPPED if saved else self.note)
         return list(self.lost.values())
 
     def _train_to(self, stop: int, report: Report) -> bool:
-        """Train up to `stop`; return False if the deadline came first."""
+        """Train up to `stop`; return False if the deadline, Ctrl-C or SIGTERM came first."""
+        if self.stops:
+            return False
         for step in self.stack.train(stop):
             late = self.schedule.deadline is not None and time.time() > self.schedule.deadline and step < stop
             if step % LOG_EVERY == 0 or step == stop:
@@ -120,7 +131,7 @@ class Trainer:
                     rows.append({"step": step, **row})
             self._arrived()
             report(step, self.note)
-            if late:
+            if late or self.stops:
                 return False
         return True
 
@@ -202,6 +213,8 @@ class Trainer:
         if self.rollouts is None:
             return
         for run, member in self._going():
+            if self.stops:
+                return  # resuming evaluates what is missing at its first step
             if step not in self.evaluations[run]:
                 stream = (int(Purpose.EVALUATION), step)
                 count = self.schedule.eval_episodes

@@ -60,20 +60,49 @@ def _held_back() -> Iterator[None]:
     The mask is for the process that starts, which inherits it. Here it is not enough: another thread, of a library's
     say, may take the signal, and Python's handler runs in the main thread all the same.
     """
-    masks, came = hasattr(signal, "pthread_sigmask"), list[int]()
-    ours = STOPS if threading.current_thread() is threading.main_thread() else ()  # only this one may set handlers
-    known = [stop for stop in ours if signal.getsignal(stop) is not None]  # None: not Python's, no way to put it back
-    handlers = {stop: signal.signal(stop, lambda number, _: came.append(number)) for stop in known}
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS) if masks else set()
+    masks = hasattr(signal, "pthread_sigmask")
+    with stops_noted():
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS) if masks else set()
+        try:
+            yield
+        finally:
+            if masks:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def stops_noted(second_at_once: bool = False) -> Iterator[list[int]]:
+    """Take note of Ctrl-C and SIGTERM in the list that this yields; what they do, they do at the end.
+
+    Args:
+        second_at_once: let a second Ctrl-C raise KeyboardInterrupt without waiting for the end.
+    """
+    came: list[int] = []
+
+    def note(number: int, frame: types.FrameType | None) -> None:
+        came.append(number)
+        if second_at_once and number == signal.SIGINT:
+            if came.count(number) > 1:
+                signal.default_int_handler(number, frame)
+            announce_stop()
+
+    # only the main thread may set handlers; None is a handler that Python cannot put back
+    ours = STOPS if threading.current_thread() is threading.main_thread() else ()
+    known = [stop for stop in ours if signal.getsignal(stop) not in (None, signal.SIG_IGN)]
+    handlers = {stop: signal.signal(stop, note) for stop in known}
     try:
-        yield
+        yield came
     finally:
         for stop, handler in handlers.items():
             signal.signal(stop, handler)
-        if masks:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         if came:
             signal.raise_signal(came[0])
+
+
+def announce_stop() -> None:
+    """Tell who pressed Ctrl-C on a terminal what is being waited for."""
+    if sys.stderr.isatty():  # written past Python's buffers, which a signal handler must leave alone
+        os.write(sys.stderr.fileno(), b"\noffbench: saving a checkpoint; press Ctrl-C again to stop at once\n")
 
 
 class _Here:
