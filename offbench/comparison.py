@@ -12,6 +12,7 @@ from typing import Any
 from offbench.errors import OffbenchError, unknown
 from offbench.registry import algorithm_names
 from offbench.results import REFERENCES, Entry, Results, Task, Trained, read_results, window_words
+from offbench.runs import folder_name
 from offbench.statistics import Estimate, Paired, improvement, paired
 from offbench.wording import counted
 
@@ -220,7 +221,8 @@ def select(results: Results, selector: str) -> list[Entry]:
         raise unknown("algorithm", algorithm, here)
     variants = {method.variant: method for method in known}
     labels = {method.label.partition(" ")[2]: method.variant for method in known}  # as tables say it: beta=adaptive
-    variant = labels.get(variant, variant)
+    folders = {folder_name(name): name for name in variants}
+    variant = labels.get(variant, folders.get(variant, variant))
     if not slash:
         variant = next(iter(variants)) if len(variants) == 1 else "default"
         if variant not in variants:

@@ -17,7 +17,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 from gymnasium.envs.registration import EnvSpec
 
-from offbench.errors import OffbenchError, unknown
+from offbench.errors import OffbenchError, nearest, unknown
 from offbench.files import disk_errors, read_json, sole
 from offbench.levels import parse_level
 from offbench.policy import Array
@@ -96,10 +96,20 @@ def _absent(dataset_id: str) -> OffbenchError:
             return OffbenchError(f"{dataset_id} is not recorded yet: {command}")
         if not exists(name):
             return OffbenchError(f"unknown dataset {dataset_id!r}: {command} records {name}")
+    with contextlib.suppress(OffbenchError):  # no id
+        if "/" in check_id(dataset_id):
+            return _not_downloaded(dataset_id)
     said = str(unknown("dataset", dataset_id, local_ids()))
     return OffbenchError(
         f"{said}{' Or' if said.endswith('?') else ';'} record one: `offbench collect ENV --level LEVEL`"
     )
+
+
+def _not_downloaded(dataset_id: str) -> OffbenchError:
+    """Return the error for an id with a namespace, as Minari's server has them (`mujoco/hopper/medium-v0`)."""
+    near = nearest(dataset_id, (known for known in local_ids() if "/" in known))
+    hint = f"did you mean {near!r}? Or download it" if near else "download it"
+    return OffbenchError(f"no local dataset {dataset_id!r}: {hint} with `minari download {dataset_id}`")
 
 
 def read_metadata(dataset_id: str) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from offbench.files import output_file, write_bytes
 from offbench.policy import Array, Policy, load_policy
 from offbench.runs import Run
 
+ENDINGS = (".pt", ".pth", ".ts")
 ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
 
 
@@ -60,9 +61,12 @@ def export_policy(path: str | Path, out: str | Path) -> Path:
     The file also says where the policy comes from (`_extra_files`, "offbench.json").
 
     Raises:
-        OffbenchError: no policy there, one that has no single best action, no such folder, or the disk refuses.
+        OffbenchError: no policy there, one that has no single best action, a file that does not end in .pt, no such
+            folder, or the disk refuses.
     """
     place, target = Path(path), output_file(out)
+    if target.suffix.lower() not in ENDINGS:
+        raise OffbenchError(f"cannot write {target.name!r}: policies are exported as TorchScript; give --out FILE.pt")
     policy = load_policy(Run(place).policy_path if place.is_dir() else place)
     if policy.kind not in ("tanh", "squashed_gaussian"):
         reason = "chooses among random actions" if policy.kind == "best_by_q" else "is random"

@@ -31,7 +31,7 @@ from offbench.safefile import SafeFile, safe_file
 from offbench.survey import episodes_of
 from offbench.transitions import open_minari
 
-FORMATS = ("d4rl", "npz")
+FORMATS = {"d4rl": (".hdf5", ".h5"), "npz": (".npz",)}  # and how their files end
 TRAVELS = (  # Minari's metadata that go along
     *("env_spec", "eval_env_spec", "algorithm_name", "description", "author", "author_email", "requirements"),
     *("ref_min_score", "ref_max_score", "num_episodes_average_score", dataset.KEY),
@@ -43,13 +43,13 @@ ATTRIBUTE = 60_000  # bytes that HDF5 lets an attribute have
 Columns = dict[str, Array]
 
 
-def export(dataset_id: str, out: str | Path, *, style: str = "d4rl", drop_timeouts: bool = False) -> Path:
+def export(dataset_id: str, out: str | Path, *, style: str | None = None, drop_timeouts: bool = False) -> Path:
     """Write a local Minari dataset with flat Box spaces to one file for other programs.
 
     Args:
         dataset_id: its id.
         out: the file; what is there is replaced at the last moment.
-        style: d4rl or npz.
+        style: d4rl or npz (default: as the file ends, .hdf5 or .npz).
         drop_timeouts: npz only: leave out the steps at a timeout, as D4RL's qlearning_dataset does. (It also never
             reads a file's very last row; one that terminates is kept here.)
 
@@ -57,10 +57,10 @@ def export(dataset_id: str, out: str | Path, *, style: str = "d4rl", drop_timeou
         The file.
 
     Raises:
-        OffbenchError: no such dataset, other spaces, damaged data, no such folder, or the disk refuses.
+        OffbenchError: no such dataset, other spaces, damaged data, a file that ends otherwise than its format, no such
+            folder, or the disk refuses.
     """
-    if style not in FORMATS:
-        raise OffbenchError(f"a format is one of {', '.join(FORMATS)}, not {style!r}")
+    style = _style(Path(out), style)
     if drop_timeouts and style == "d4rl":
         raise OffbenchError("--drop-timeouts goes with --format npz: whoever reads a D4RL file drops them himself")
     path, metadata, data = output_file(out), dataset.read_metadata(dataset_id), open_minari(dataset_id)
@@ -79,6 +79,17 @@ def export(dataset_id: str, out: str | Path, *, style: str = "d4rl", drop_timeou
             os.fsync(file.fileno())
         os.replace(aside, path)
     return path
+
+
+def _style(out: Path, style: str | None) -> str:
+    """Return the format, asked for or as the file's name ends. Raises OffbenchError if the two do not fit."""
+    if style not in (None, *FORMATS):
+        raise OffbenchError(f"a format is one of {', '.join(FORMATS)}, not {style!r}")
+    found = next((name for name, endings in FORMATS.items() if out.suffix.lower() in endings), None)
+    if found is None or style not in (None, found):
+        wanted = " or ".join(ending for name in FORMATS if style in (None, name) for ending in FORMATS[name])
+        raise OffbenchError(f"cannot write {out.name!r}: {f'{style} files' if style else 'exports'} end in {wanted}")
+    return found
 
 
 def _columns(data: Any, dataset_id: str, progress: Progress) -> Iterator[Columns]:

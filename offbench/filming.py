@@ -172,11 +172,15 @@ def _frame(env: gym.Env[Any, Any], step: int, total: float, size: int) -> Image:
     """Draw the environment as it stands, with step and return on it."""
     from PIL import Image, ImageDraw, ImageFont
 
+    name = env.spec.id if env.spec else "the environment"
     try:
         pixels = env.render()
     except NotImplementedError:
-        name = env.spec.id if env.spec else "the environment"
         raise OffbenchError(f"{name} cannot be filmed: it has no rgb_array rendering") from None
+    except Exception as error:  # a third party's environment may raise anything here
+        lacks = error.name if isinstance(error, ModuleNotFoundError) else None
+        hint = f"; install the package that has {lacks}" if lacks else ""  # Gymnasium's own errors say which
+        raise OffbenchError(f"{name} cannot be filmed: {str(error) or type(error).__name__}{hint}") from error
     if not isinstance(pixels, np.ndarray) or pixels.ndim != 3:
         raise OffbenchError(f"the environment draws {type(pixels).__name__}, not a picture of [height, width, 3]")
     image = Image.fromarray(pixels[..., :3].astype(np.uint8))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import operator
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -125,6 +126,8 @@ def configurations(cls: type, settings: Mapping[str, Any], algorithm: str) -> li
         values = list(value) if _several(value, known[name].default) else [value]
         if not values:
             raise OffbenchError(f"{algorithm}: {name} got an empty list")
+        if len(values) > 1 and isinstance(known[name].default, tuple):
+            _check_lists(values, f"{algorithm}: {name}")
         columns.append([(name, check(cls, name, item, algorithm)) for item in values])
     return list(dict.fromkeys(cls(**dict(row)) for row in itertools.product(*columns)))
 
@@ -133,7 +136,16 @@ def _several(value: Any, default: Any) -> bool:
     """Return whether a list holds values of a setting, rather than being one, as (64, 64) is of `hidden`."""
     if not isinstance(value, list | tuple):
         return False
-    return not isinstance(default, tuple) or any(isinstance(item, list | tuple) for item in value)
+    return not isinstance(default, tuple) or any(isinstance(item, list | tuple | str) for item in value)
+
+
+def _check_lists(values: Sequence[Any], what: str) -> None:
+    """Refuse `64 64`, which may mean one network of two layers or two of one."""
+    if any(isinstance(item, str) and not re.search("[,x]", item) for item in values):
+        typed = [str(item) for item in values]
+        raise OffbenchError(
+            f"{what} takes lists such as 32,32 64,64, not {' '.join(typed)}; one list is {','.join(typed)}"
+        )
 
 
 def _check_numbers(seeds: Sequence[int], steps: int, eval_every: int, eval_episodes: int) -> None:

@@ -36,7 +36,7 @@ def parse_level(text: str) -> tuple[str, tuple[Part, ...]]:
     """Return (name in a dataset id, parts) of a level's name or of a fraction such as `0.6`.
 
     Raises:
-        OffbenchError: an unknown level (the nearest is named), or a fraction outside (0, 1].
+        OffbenchError: an unknown level, or a fraction outside (0, 1].
     """
     if text in LEVELS:
         return text, LEVELS[text]

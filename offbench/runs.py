@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import Any
 
 from offbench.errors import OffbenchError
-from offbench.files import csv_bytes, read_json, write_bytes, write_json
+from offbench.files import csv_bytes, read_json, sha256, write_bytes, write_json
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 FORMAT = "offbench-run-1"
+LONGEST = 255  # bytes of a file's name, on the usual file systems
 DIGITS = 8  # of a content hash, where a table must tell two contents of one dataset id apart
 REQUIRED = {  # what a config.json must hold, and of which kind
     **dict.fromkeys(("algorithm", "variant", "dataset", "dataset_sha256"), str),
@@ -209,8 +210,16 @@ def _is_run(path: Path) -> bool:
 
 
 def run_folder(root: Path, dataset_id: str, algorithm: str, variant: str, seed: int) -> Path:
-    """Return runs/<dataset>/<algorithm>/<variant>/seed-<n>."""
-    return root / dataset_id / algorithm / variant / f"seed-{seed}"
+    """Return runs/<dataset>/<algorithm>/<variant>/seed-<n>; a long variant is cut short and ends in its hash."""
+    return root / dataset_id / algorithm / folder_name(variant) / f"seed-{seed}"
+
+
+def folder_name(variant: str) -> str:
+    """Return the name of a variant's folder: the variant itself, if a file system takes a name that long."""
+    if len(variant.encode()) <= LONGEST:
+        return variant
+    ending = f"...{sha256(variant.encode())[:16]}"
+    return variant.encode()[: LONGEST - len(ending)].decode(errors="ignore") + ending
 
 
 def variant(config: Any) -> str:

@@ -82,7 +82,7 @@ CASES: dict[str, tuple[str, str]] = {
     ),
     "train td3_bc --dataset MEDIUM --batchsize=3": ("--batchsize: did you mean --batch-size?", ""),
     "train td3_bc --datset MEDIUM": ("unrecognized arguments: --datset: did you mean --dataset?", ""),
-    "train td3_bc --dataset MEDIUM --hidden 64 64": ("unrecognized arguments: 64 (see `offbench train td3_bc", ""),
+    "train td3_bc --dataset MEDIUM --hidden 64 64": ("hidden takes lists such as 32,32 64,64", "64,64"),
     "--flag collect hopper": ("unrecognized arguments: --flag (see `offbench --help`)", ""),
     "train bdb --dataset DISCRETE": ("actions must be a Box space, not Discrete(2)", ""),
     "train bdb --dataset NAN": ("rewards hold NaN or infinite numbers", ""),
@@ -107,7 +107,7 @@ CASES: dict[str, tuple[str, str]] = {
     "train td3_bc --dataset MEDIUM --wandb": ("argument --wandb: expected one argument", ""),
     "show x-v0": (
         "unknown dataset 'x-v0'",
-        "'nan-v0'? Or record one: `offbench collect ENV --level LEVEL`",
+        "known: discrete-v0, nan-v0, tiny-medium-v0; record one: `offbench collect ENV --level LEVEL`",
     ),
     "show xyzzy-v0": ("known: discrete-v0, nan-v0, tiny-medium-v0; record one: `offbench collect ENV", ""),
     "show hopper-medium-expert-v0": (
@@ -145,6 +145,17 @@ CASES: dict[str, tuple[str, str]] = {
     "export MEDIUM --out out.hdf5 --drop-timeouts": ("--drop-timeouts goes with --format npz", ""),
     "export MEDIUM --out .": ("cannot write", ""),
     "export MEDIUM --out empty.safetensors/out.hdf5": ("cannot write", ""),
+    "export MEDIUM --out out.csv": ("cannot write 'out.csv'", ".npz"),
+    "export MEDIUM --out out.npz --format d4rl": ("cannot write 'out.npz'", ".hdf5"),
+    "export MEDIUM --out out.hdf5 --format npz": ("cannot write 'out.hdf5'", ".npz"),
+    "export-policy policy.safetensors --out policy.onnx": ("cannot write 'policy.onnx'", ".pt"),
+    "report --out report.html": ("a report is a folder", "--out report"),
+    "show mujoco/hopper/medium-v0": ("no local dataset", "`minari download mujoco/hopper/medium-v0`"),
+    "train bc --dataset mujoco/hopper/medium-v0": ("no local dataset", "`minari download mujoco/hopper/medium-v0`"),
+    "verify mujoco/hopper/medium-v0": ("no local dataset", "`minari download mujoco/hopper/medium-v0`"),
+    "train iql --dataset MEDIUM": ("unknown algorithm 'iql': known: bc", "td3_bc"),
+    "plot": ("unknown command 'plot': known: ", "report"),
+    "eval": ("did you mean 'evaluate'?", ""),
     "export MEDIUM --out new/out.hdf5": ("cannot write new/out.hdf5: there is no folder new", ""),
     "export-policy policy.safetensors --out new/policy.pt": ("there is no folder new", ""),
     "show MEDIUM --plot new/a.png": ("cannot write new/a.png: there is no folder new", ""),
@@ -347,3 +358,12 @@ def test_a_changed_recipe_is_another_training(tiny: tuple[str, str], home: Path)
     (home / "tiny.toml").write_text(text)
     with pytest.raises(OffbenchError, match=r"sac\.steps 2400, not 3200; .*offbench behaviour ENV --steps N"):
         offbench.behaviour("./tiny.toml", behaviour_dir=tiny[1])
+
+
+def test_the_suffix_says_what_is_exported(medium: str, home: Path) -> None:
+    main(["export", medium, "--out", "arrays.npz"])
+    with np.load(home / "arrays.npz", allow_pickle=False) as arrays:
+        assert len(arrays["rewards"]) == 600
+    main(["export", medium, "--out", "rows.h5"])
+    with h5py.File(home / "rows.h5") as file:
+        assert len(file["rewards"]) == 600

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +15,13 @@ from safetensors.torch import load_file, save_file
 
 import offbench
 from offbench import checkpoints
+from offbench.cli import main
 from offbench.errors import OffbenchError
 from offbench.jobs import Job, Order, perform
 from offbench.runs import Run
 from offbench.stacking import cut, pending
 from offbench.training import Schedule
+from tests.test_transitions import episode, foreign
 
 SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32}
 TIMES: dict[str, Any] = {"eval_every": 100, "eval_episodes": 2}
@@ -142,3 +145,40 @@ def test_td3_bc_as_a_guest_in_a_stack_of_bdb_is_td3_bc(medium: str) -> None:
     assert theirs.keys() < ours.keys()
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
     assert bdb.host is None
+
+
+def test_several_networks_in_one_command(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--steps", "2", "--eval-every", "2", "--eval-episodes", "1", "--workers", "1"]
+    main(["train", "bc", "--dataset", medium, *words, "--hidden", "8,8", "16x16", "--runs", "my runs"])
+    *folders, hint = capsys.readouterr().out.splitlines()
+    assert [Run(Path(folder)).config()["settings"]["hidden"] for folder in folders] == [[8, 8], [16, 16]]
+    main(shlex.split(hint.removeprefix("next: offbench ")))  # as it can be pasted
+    assert "hidden=16x16" in capsys.readouterr().out
+
+
+def test_any_number_of_settings_has_a_folder(medium: str) -> None:
+    settings = {"alpha": 3.0, "discount": 0.98, "tau": 0.01, "policy_noise": 0.3, "noise_clip": 0.4, "policy_freq": 3}
+    settings |= {"actor_learning_rate": 0.001, "critic_learning_rate": 0.001, "normalize": False, "beta": "adaptive"}
+    settings |= {"beta_scope": "batch", "critics": 3, "uncertainty": "relative", "uncertainty_scale": 2.0}
+    settings |= {"beta_max": 0.5, "cloning_steps": 1, "critic_penalty": "cql", "penalty_weight": [2.0, 3.0]}
+    more: dict[str, Any] = {"steps": 2, "eval_every": 2, "eval_episodes": 1, "workers": 1, **SMALL, **settings}
+    folders = offbench.train("bdb", medium, **more)
+    assert len(set(folders)) == 2
+    assert all(len(part.encode()) <= 255 for folder in folders for part in folder.parts)
+    variants = [Run(folder).config()["variant"] for folder in folders]
+    assert ["penalty_weight=2," in variants[0], "penalty_weight=3," in variants[1]] == [True, True]
+    assert offbench.train("bdb", medium, **more) == folders  # finished already
+    found = offbench.compare(*[f"bdb/{folder.parent.name}" for folder in folders])
+    assert found.a.endswith(variants[0])
+    assert found.b.endswith(variants[1])
+
+
+def test_data_without_an_environment_are_trained_on_and_that_is_said(
+    home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    foreign("house-v0", [episode(40, 0, True), episode(40, 1, True)])
+    main(["train", "bc", "--dataset", "house-v0", "--steps", "2", "--eval-every", "2", "--hidden", "8,8"])
+    out, err = capsys.readouterr()
+    assert "house-v0 names no environment" in err
+    assert "normalize" not in out
+    assert "offbench evaluate runs/house-v0/bc/hidden=8x8/seed-0 --env" in out

@@ -150,6 +150,30 @@ def test_an_environment_that_does_not_draw_is_one_line(mode: str, home: Path, of
     assert not list(home.glob("*.gif"))
 
 
+@pytest.mark.parametrize(
+    ("failure", "remedy"),
+    [
+        ("raise gym.error.DependencyNotInstalled('run `pip install pygame`')", "pip install pygame"),
+        ("import no_such_renderer", "no_such_renderer"),
+        ("raise RuntimeError", "RuntimeError"),
+    ],
+)
+def test_an_environment_without_its_renderer_is_one_line(
+    failure: str, remedy: str, home: Path, offbench_cli: Cli
+) -> None:
+    code = TANK.replace("MODE", "self.render_mode = options.get('render_mode')")
+    (home / "tank.py").write_text(
+        code.replace("    def step(", f"    def render(self):\n        {failure}\n\n    def step(")
+    )
+    (home / "tank.toml").write_text('env_id = "tank:Tank-v0"\n')
+    done = offbench_cli("video", str(POLICY), "--env", "./tank.toml")
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("offbench: Tank-v0 cannot be filmed")
+    assert remedy in line
+    assert not list(home.glob("*.gif"))
+
+
 def test_mp4_without_its_encoder_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 from typing import Any, NoReturn
 
-from offbench.errors import OffbenchError
+from offbench.errors import OffbenchError, nearest
 
 
 class Parser(argparse.ArgumentParser):
@@ -36,8 +35,8 @@ class Parser(argparse.ArgumentParser):
         known = [name for name in self._option_string_actions if name.startswith("--")]
         if not flag.startswith("--") or any(name.startswith(flag) for name in known):  # argparse takes abbreviations
             return
-        near = difflib.get_close_matches(flag[2:], [name[2:] for name in known], n=1, cutoff=0.7)
-        hint = f": did you mean --{near[0]}?" if near else ""
+        near = nearest(flag[2:], [name[2:] for name in known])
+        hint = f": did you mean --{near}?" if near else ""
         self.error(f"unrecognized arguments: {flag}{hint}")
 
 

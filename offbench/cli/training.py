@@ -45,7 +45,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         group.add_argument(
             f"--{name.replace('_', '-')}",
             dest=f"setting_{name}",
-            nargs=None if isinstance(field.default, tuple) else "+",
+            nargs="+",
             metavar="N,N" if isinstance(field.default, tuple) else "X",
             default=argparse.SUPPRESS,
             help=_help(field).replace("%", "%%"),
@@ -53,13 +53,18 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
 
     def run(**arguments: Any) -> None:
         from offbench.launch import train
+        from offbench.runs import Run
 
         settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
         rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
         folders = train(**rest, **settings, command=shlex.join(["offbench", "train", *words]))
         for folder in folders:
             print(folder)
-        print(f"next: offbench normalize --runs {rest['runs']}")
+        if any(Run(folder).evaluations() for folder in folders):
+            print(f"next: {shlex.join(['offbench', 'normalize', '--runs', rest['runs']])}")
+        else:
+            evaluate = shlex.join(["offbench", "evaluate", str(folders[0])])
+            print(f"next: {evaluate} --env RECIPE, with a recipe of the environment that the dataset is of")
 
     parser.set_defaults(run=run)
 

@@ -44,8 +44,8 @@ def import_arguments(parser: Parser, _: list[str]) -> None:
 def export_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `export`."""
     parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset")
-    parser.add_argument("--out", required=True, metavar="FILE", help="the file to write")
-    parser.add_argument("--format", choices=("d4rl", "npz"), default="d4rl", dest="style", help="default: d4rl")
+    parser.add_argument("--out", required=True, metavar="FILE", help="the file to write: .hdf5 (D4RL) or .npz")
+    parser.add_argument("--format", choices=("d4rl", "npz"), dest="style", help="default: as the file ends")
     parser.add_argument(
         "--drop-timeouts", action="store_true", help="npz: without the steps that D4RL's qlearning_dataset drops"
     )

@@ -46,7 +46,10 @@ def report(runs: str | Path = "runs", out: str | Path = "report") -> Path:
     Raises:
         OffbenchError: no evaluated runs, a damaged one, or the folder cannot be written.
     """
-    results, folder = read_results(runs), Path(out)
+    folder = Path(out)
+    if folder.suffix.lower() in (".html", ".htm", ".pdf"):
+        raise OffbenchError(f"a report is a folder with an {PAGE} in it: give --out {folder.with_suffix('')}")
+    results = read_results(runs)
     before = _older(folder)
     found, pictures = _tables(results), _figures(results)
     written = {f"tables/{one.name}.{end}": data for one in found.values() for end, data in files(one).items()}
