@@ -11,6 +11,7 @@ they hold the same data.
 from __future__ import annotations
 
 import csv
+import shlex
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -53,9 +54,11 @@ def card(env: str, out: str | Path | None = None, behaviour_dir: str | Path = BE
     if ladder is None:
         raise OffbenchError(
             f"{recipe.name} has no ladder to describe, shipped or in {behaviour_dir}; "
-            f"build one with `offbench behaviour {env}`, or give its --behaviour-dir"
+            f"build one with `offbench behaviour {shlex.quote(env)}`, or give its --behaviour-dir"
         )
-    levels = {level: _recorded(recipe, ladder, level) for level in LEVELS}
+    own = [] if Path(behaviour_dir) == Path(BEHAVIOUR) else ["--behaviour-dir", str(behaviour_dir)]
+    collect = shlex.join(["offbench", "collect", env, *own])
+    levels = {level: _recorded(recipe, ladder, level, collect) for level in LEVELS}
     facts = {level: _facts(recipe, summary) for level, summary in levels.items()}
     means = [facts[level]["return"] for level in LEVELS]
     if sorted(means) != means:
@@ -86,13 +89,11 @@ def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
     return f"warning: content differs from the dataset card's, {reason}"
 
 
-def _recorded(recipe: Recipe, ladder: Ladder, level: str) -> Summary:
-    """Return a recorded level, checked to be what the card claims."""
+def _recorded(recipe: Recipe, ladder: Ladder, level: str, collect: str) -> Summary:
+    """Return a recorded level, checked to be what the card claims. `collect` is the command that records it."""
     dataset_id = f"{recipe.name}-{level}-v{recipe.version}"
     if dataset_id not in dataset.local_ids():
-        raise OffbenchError(
-            f"{dataset_id} is not recorded yet; first `offbench collect {recipe.name} --level {level}`"
-        )
+        raise OffbenchError(f"{dataset_id} is not recorded yet; first `{collect} --level {level}`")
     found = show(dataset_id)
     ours = dataset.provenance(found.metadata)
     parts = LEVELS[level]
@@ -103,7 +104,7 @@ def _recorded(recipe: Recipe, ladder: Ladder, level: str) -> Summary:
     if not same or int(found.lengths.sum()) != size:
         raise OffbenchError(
             f"{dataset_id} is not the level that is shipped (seed 0, {size:,.0f} transitions, this ladder); "
-            f"record it with `offbench collect {recipe.name} --level {level} --overwrite`"
+            f"record it with `{collect} --level {level} --overwrite`"
         )
     return found
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shlex
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -31,7 +32,7 @@ def check_recorded(source: Source) -> None:
         seed = f" --seed {source.seed}" if source.seed else ""
         raise OffbenchError(
             f"the {source.id} that is here is not what the grid means: it has {', '.join(differences)}; record it "
-            f"again (`offbench collect {source.env} --level {source.level}{steps}{seed} --id {source.id} "
+            f"again (`offbench collect {shlex.quote(source.env)} --level {source.level}{steps}{seed} --id {source.id} "
             "--overwrite`), or write another id into the grid"
         )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shlex
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,9 @@ def score_returns(env: str, returns: Sequence[float], behaviour_dir: str | Path 
     ours = (ladder.random_return, ladder.expert_return) if ladder else None
     d4rl = (recipe.d4rl_min, recipe.d4rl_max) if recipe.d4rl_min is not None else None
     if not ours and not d4rl:
-        raise OffbenchError(f"{env} has no reference scores yet; measure them with `offbench behaviour {env}`")
+        raise OffbenchError(
+            f"{env} has no reference scores yet; measure them with `offbench behaviour {shlex.quote(env)}`"
+        )
     return [
         {
             "environment": recipe.env_id,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -117,5 +118,9 @@ def test_a_ladder_that_lacks_a_policy_is_damaged(tiny: tuple[str, str], home: Pa
 def test_a_card_of_ones_own_looks_where_the_agent_was_trained(tiny: tuple[str, str]) -> None:
     with pytest.raises(OffbenchError, match="tiny has no ladder to describe, shipped or in behaviour"):
         card(tiny[0])
-    with pytest.raises(OffbenchError, match="tiny-random-v0 is not recorded yet"):
+    with pytest.raises(OffbenchError, match="tiny-random-v0 is not recorded yet") as refused:
+        card(tiny[0], behaviour_dir=tiny[1])
+    hint = str(refused.value).partition("`")[2].partition("`")[0]
+    main(shlex.split(hint)[1:])  # as it can be pasted
+    with pytest.raises(OffbenchError, match="tiny-medium-replay-v0 is not recorded yet"):
         card(tiny[0], behaviour_dir=tiny[1])

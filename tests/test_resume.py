@@ -291,7 +291,7 @@ def test_training_survives_kill_9(medium: str, home: Path) -> None:
     words = ["train", "bdb", "--dataset", medium, "--steps", "1500", "--eval-every", "100", "--eval-episodes", "2"]
     words += ["--hidden", "16,16", "--batch-size", "32", "--seeds", "0:2"]
     command = [sys.executable, "-m", "offbench", *words]
-    subprocess.run([*command, "--runs", "whole"], check=True, capture_output=True)
+    wholes = train("bdb", medium, "whole", 1500, seeds=[0, 1])
     folder = home / "killed" / medium / "bdb" / "batch_size=32,hidden=16x16"
     kills = 0
     for delay in (0.0, 0.05, 0.13, 0.21):
@@ -302,13 +302,9 @@ def test_training_survives_kill_9(medium: str, home: Path) -> None:
         kill_when(process, lambda seen=seen: set(checkpoints.steps(folder / "seed-0")) - seen, delay)
         kills += process.returncode == -signal.SIGKILL
     assert kills >= 2
-    subprocess.run([*command, "--runs", "killed"], check=True, capture_output=True)
-    for seed in (0, 1):
-        whole, killed = (
-            Run(home / r / folder.relative_to(home / "killed") / f"seed-{seed}") for r in ("whole", "killed")
-        )
-        assert whole.policy_path.read_bytes() == killed.policy_path.read_bytes()
-        assert whole.evaluations_path.read_bytes() == killed.evaluations_path.read_bytes()
+    for killed, whole in zip(train("bdb", medium, "killed", 1500, seeds=[0, 1]), wholes, strict=True):
+        assert killed.folder.parent == folder.relative_to(home)
+        assert_same_files(killed, whole)
 
 
 @pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
