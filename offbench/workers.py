@@ -15,6 +15,7 @@ from typing import Any
 from offbench.errors import OffbenchError
 
 STOPS = {signal.SIGINT, signal.SIGTERM}
+LAST = 2.0  # seconds that a worker has to end when its pool closes
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -115,9 +116,13 @@ def start_worker(parent: int, closing: Any = None) -> None:
     """Leave Ctrl-C to the parent, and end when the parent is gone (even by kill -9).
 
     Args:
-        closing: a shared number; when it is not 0, nothing that this worker is at is wanted any more.
+        closing: a shared number; when it is not 0, nothing that this worker is at is wanted any more. A worker that
+            has one leaves SIGTERM to the parent too: Slurm sends it to all processes, and a parent that saves a
+            checkpoint still waits for its evaluations.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if closing is not None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)  # held back while it started
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
@@ -135,6 +140,8 @@ def loaded(names: Sequence[str]) -> list[str]:
 
 
 def _watch(parent: int) -> None:
-    while os.getppid() == parent:
+    while os.getppid() == parent and not closing():
         time.sleep(1.0)
+    if os.getppid() == parent:
+        time.sleep(LAST)  # the pool ends its workers itself, unless one of them was killed
     os._exit(1)

@@ -27,6 +27,7 @@ from offbench.rollout import LANES, Episode, Rollouts, Task, play, result
 from offbench.seeds import Purpose
 from offbench.workers import quiet_start
 
+POLE = env_spec("InvertedPendulum-v5")
 BOUNDS = np.full(3, -1, np.float32), np.full(3, 1, np.float32)
 
 
@@ -146,6 +147,33 @@ def test_the_last_episode_is_cut_and_truncated() -> None:
     assert (cut[-1].terminated, cut[-1].truncated) == (False, True)
     assert cut[-1].observations.shape == (2, 11)
     assert all(episode.terminated for episode in cut[:-1])
+
+
+def test_sigterm_to_all_processes_leaves_evaluations_to_the_parent() -> None:
+    """Slurm sends it so; the parent saves a checkpoint, and that waits for the evaluations under way."""
+    policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
+    with Rollouts(POLE, workers=2) as rollouts:
+        result(rollouts.submit(Task(POLE, policy.to_bytes(), 0, (), (0,), True, True)))
+        future = rollouts.outcomes(policy, 0, (), 400, False)
+        assert rollouts._pool is not None
+        for pid in rollouts._pool._processes:
+            os.kill(pid, signal.SIGTERM)
+        assert len(result(future)) == 400
+
+
+def test_a_killed_worker_ends_those_beside_it() -> None:
+    policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
+    with Rollouts(POLE, workers=2) as rollouts:
+        result(rollouts.outcomes(policy, 0, (), 100, False))
+        assert rollouts._pool is not None
+        first, *beside = rollouts._pool._processes
+        future = rollouts.outcomes(policy, 0, (), 4000, False)
+        os.kill(first, signal.SIGKILL)
+        with pytest.raises(OffbenchError, match="a worker process died"):
+            result(future)
+        began = time.monotonic()
+    assert beside
+    assert time.monotonic() - began < 30
 
 
 def test_a_killed_worker_is_a_clear_error() -> None:
