@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from offbench.environments import checked_spec, env_spec, same_environment
@@ -151,6 +152,17 @@ def similarity(
     return found
 
 
+def _registered(env_id: str, path: Path) -> str:
+    """Return a policy file's `env_id` without the module before its colon, which Gymnasium would import."""
+    module, _, name = env_id.rpartition(":")
+    if module and name not in gym.registry:
+        raise OffbenchError(
+            f"{path} names its environment as {env_id!r}, and a module that a file names is not imported; "
+            "give the recipe of the environment with --env"
+        )
+    return name
+
+
 def open_policy(path: Path, env: str | None = None) -> tuple[Policy, Mapping[str, Any], str]:
     """Return the policy of a run's directory or a policy file, the run's config ({} for a file) and its EnvSpec.
 
@@ -174,7 +186,7 @@ def open_policy(path: Path, env: str | None = None) -> tuple[Policy, Mapping[str
     elif isinstance(config.get("env_spec"), str):
         text = config["env_spec"]
     elif policy.env_id:
-        text = env_spec(policy.env_id)
+        text = env_spec(_registered(policy.env_id, path))
     else:
         raise OffbenchError(f"{path} names no environment; give one with --env")
     return policy, config, checked_spec(text, str(path), len(policy.observation_mean), len(policy.low))

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import h5py
 import numpy as np
 from filelock import FileLock
 
@@ -101,23 +102,42 @@ def load(dataset_id: str) -> Transitions:
 
     Raises:
         OffbenchError: no such dataset, spaces other than flat Boxes, NaN or infinite numbers, wrong shapes,
-            damaged files.
+            damaged files, data that are not those of the recorded hash.
     """
     metadata = dataset.read_metadata(dataset_id)
-    data = open_minari(dataset_id)
+    data = _open(dataset_id)
     observation_space = box(data.observation_space, f"{dataset_id}: observations")
     action_space = box(data.action_space, f"{dataset_id}: actions")
     if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
         raise OffbenchError(f"{dataset_id}: the action space must be bounded to be scaled, not {action_space}")
     folder = cache() / _key(dataset_id, metadata)
-    with disk_errors(str(folder)):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder.with_name(f"{folder.name}.lock")):
-            if not (folder / "meta.json").exists():
-                _convert(data, dataset_id, observation_space, action_space, folder)
-    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ARRAYS}
-    content = json.loads((folder / "meta.json").read_text())["content_sha256"]
+    found = _mapped(folder)
+    if found is None:
+        with disk_errors(str(folder)):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            with FileLock(folder.with_name(f"{folder.name}.lock")):
+                found = _mapped(folder)  # another process may have converted it meanwhile
+                if found is None:
+                    _convert(data, dataset_id, observation_space, action_space, folder)
+                    found = _mapped(folder)
+    if found is None:
+        raise OffbenchError(f"cannot read back {folder}; delete it and try again")
+    content, arrays = found
+    if dataset.provenance(metadata).get("content_sha256", content) != content:
+        raise OffbenchError(
+            f"{dataset_id} is damaged: its arrays are not those of the content_sha256 in its metadata; "
+            "record or download it again"
+        )
     return Transitions(dataset_id, content, **arrays, low=action_space.low, high=action_space.high, metadata=metadata)
+
+
+def _mapped(folder: Path) -> tuple[str, dict[str, Array]] | None:
+    """Return the content hash and the arrays of a converted dataset; None if it is not there, or cannot be read."""
+    try:
+        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ARRAYS}
+        return str(json.loads((folder / "meta.json").read_text())["content_sha256"]), arrays
+    except Exception:  # damaged headers raise what NumPy's parsers happen to; the dataset itself is still there
+        return None
 
 
 def cache() -> Path:
@@ -140,7 +160,45 @@ def _key(dataset_id: str, metadata: dict[str, Any]) -> str:
 
 
 def open_minari(dataset_id: str) -> Any:
-    """Return the MinariDataset of a local id. Raises OffbenchError if there is none, or it is damaged."""
+    """Return the MinariDataset of a local id, to read its episodes.
+
+    Raises:
+        OffbenchError: there is none, it is damaged, or its files lead to others.
+    """
+    _check_storage(dataset_id)
+    return _open(dataset_id)
+
+
+def _check_storage(dataset_id: str) -> None:
+    """Refuse HDF5 files whose arrays lie elsewhere: HDF5 would follow them to any file of this machine."""
+    for path in sorted((dataset.path_of(dataset_id) / "data").rglob("*.hdf5")):
+        try:
+            with h5py.File(path) as file:
+                elsewhere = _elsewhere(file)
+        except (OSError, KeyError, ValueError, RuntimeError) as error:
+            raise OffbenchError(f"{dataset_id} cannot be read: {error}; record or download it again") from error
+        if elsewhere:
+            raise OffbenchError(f"{dataset_id} is not read: {elsewhere} is not data of {path}; get it from its source")
+
+
+def _elsewhere(file: h5py.File) -> str | None:
+    """Return the name of something below the root that is a link, or stored in another file."""
+    groups, seen = [file["/"]], set()
+    while groups:
+        group = groups.pop()
+        for name in group:
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                return f"{group.name}/{name}".replace("//", "/")
+            found = group[name]
+            if isinstance(found, h5py.Dataset) and (found.external or found.is_virtual):
+                return str(found.name)
+            if isinstance(found, h5py.Group) and found.id not in seen:  # hard links can make a circle
+                seen.add(found.id)
+                groups.append(found)
+    return None
+
+
+def _open(dataset_id: str) -> Any:
     metadata = dataset.read_metadata(dataset_id)
     if "observation_space" not in metadata or "action_space" not in metadata:
         # Minari would make the environment to ask it, running whatever code the file names
@@ -162,6 +220,7 @@ def open_minari(dataset_id: str) -> Any:
 
 def _convert(data: Any, dataset_id: str, observations: gym.spaces.Box, actions: gym.spaces.Box, folder: Path) -> None:
     """Read every episode once and write the arrays; meta.json comes last, then the folder gets its name."""
+    _check_storage(dataset_id)
     columns: dict[str, list[Array]] = {name: [] for name in ("observations", "actions", "rewards", "masks")}
     content, lengths, returns = dataset.ContentHash(), [], []
     with Progress(int(data.total_steps), f"converting {dataset_id}") as progress:
