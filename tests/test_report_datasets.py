@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.resources
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -48,3 +50,24 @@ def test_no_curve_over_all_tasks_without_a_method_that_has_them(home: Path) -> N
     page = Page(offbench.report(home / "runs", home / "out"))
     assert "all tasks, 95% interval shaded; methods" not in page.text
     assert not list((home / "out").rglob("curves-iqm*"))
+
+
+def test_a_shipped_dataset_card_is_shown(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = Path(str(importlib.resources.files("offbench.reports")))
+    shutil.copytree(package / "assets", home / "package" / "assets")
+    shutil.copytree(package / "published", home / "package" / "published")
+    values = {"transitions": 1000, "episodes": 7, "return": 12.3, "std": 4.5, "score": 33.3, "terminated": 0.25}
+    card = {"versions": {"mujoco": "3.4.0"}, "levels": {"medium": values | {"content_sha256": "0123456789abcdef"}}}
+    write_json(home / "package" / "datasets" / "hopper" / "card.json", card)
+    (home / "package" / "datasets" / "hopper" / "card.png").write_bytes(b"\x89PNG")
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    made_run(home / "runs", "my-medium-v0", "td3_bc", "default", 0, 50)
+    monkeypatch.setattr(importlib.resources, "files", lambda _: home / "package")
+    page = Page(offbench.report(home / "runs", home / "out"))
+    assert "hopper (mujoco 3.4.0)" in page.text
+    assert page.text.index("Datasets that the runs were trained on") < page.text.index("Shipped cards, for reference")
+    assert "25.0%" in page.text
+    pictures = [a for name, a in page.elements if name == "img"]
+    assert len(pictures) == 1
+    assert (pictures[0]["src"] or "").startswith("data:image/png;base64,")
+    assert "hopper" in (pictures[0]["alt"] or "")

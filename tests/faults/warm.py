@@ -30,7 +30,7 @@ from offbench.environments import env_spec
 class HereRollouts(offbench.rollout.Rollouts):
     """Evaluations in the training process itself: 200 trainings need not start 200 worker processes.
 
-    Trainings with their workers are killed in test_resume.py.
+    Trainings with their workers are killed in test_interrupts.py.
     """
 
     def __init__(self, spec: str, workers: int = 0) -> None:
