@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.offbench-installed
 
-.PHONY: demo test lint bench docs clean
+.PHONY: demo test nightly lint bench docs clean
 
 # One install serves all targets; it is repeated when the requirements change.
 $(STAMP): pyproject.toml constraints.txt
@@ -19,6 +19,13 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto --dist worksteal
+
+# More of what is random in the tests of faults: kills in all, and spoiled files for each of the ten readers.
+KILLS ?= 1000
+FUZZ ?= 100000
+nightly: $(STAMP)
+	OFFBENCH_KILLS=$(KILLS) OFFBENCH_FUZZ=$(FUZZ) $(BIN)/python -m pytest -n auto --dist worksteal \
+		tests/faults/test_kill.py tests/faults/test_fuzz.py -k "kill_9 or many"
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Iterable
 
 NEAR = 0.76  # of two names' likeness: more than iql and cql, less than hoper and hopper
+SHOW_TRACEBACK = "OFFBENCH_TRACEBACK=1 shows the traceback"
 
 
 class OffbenchError(Exception):

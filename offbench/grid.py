@@ -21,6 +21,7 @@ from typing import Any
 
 from offbench import dataset
 from offbench.errors import OffbenchError, unknown
+from offbench.files import damage, read_text
 from offbench.levels import parse_level
 from offbench.recipes import load_recipe
 from offbench.settings import build, setting
@@ -94,11 +95,10 @@ def load_grid(name: str) -> Grid:
         raise unknown("grid", name, shipped_grids())
     where = f"{path.name}"
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        with damage(f"{where}: not a readable TOML file", "correct it, or name another"):
+            values = tomllib.loads(read_text(path))
     except FileNotFoundError:
         raise OffbenchError(f"no grid file {path}; shipped are {', '.join(shipped_grids())}") from None
-    except (OSError, ValueError, RecursionError) as error:  # not UTF-8, not TOML, a number of 5000 digits, a bomb
-        raise OffbenchError(f"{where}: not a readable TOML file ({error})") from None
     sources = _list(values.pop("datasets", []), "datasets", where)
     entries = _list(values.pop("algorithms", []), "algorithms", where)
     times = _times(values, Times(), where)

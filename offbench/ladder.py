@@ -20,7 +20,7 @@ import numpy as np
 
 from offbench.environments import same_environment
 from offbench.errors import OffbenchError
-from offbench.files import read_json
+from offbench.files import damage, read_json, regular
 from offbench.policy import Policy, load_policy
 from offbench.provenance import warn_other_physics
 from offbench.recipes import Recipe, load_recipe, names
@@ -101,8 +101,8 @@ def read_ladder(folder: Path) -> Ladder | None:
     if not (folder / "ladder.json").exists():
         return None
     info = read_json(folder / "ladder.json")
-    try:
-        with open(folder / "ladder.csv", newline="", encoding="utf-8") as file:
+    with damage(f"the ladder in {folder} is damaged", "delete it and build it again with `offbench behaviour`"):
+        with open(folder / "ladder.csv", newline="", encoding="utf-8", opener=regular) as file:
             rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
         ladder = Ladder(folder, info, rungs)
         known = [float(info["references"][name][key]) for name in ("random", "expert") for key in REFERENCE]
@@ -115,19 +115,6 @@ def read_ladder(folder: Path) -> Ladder | None:
             raise ValueError(f"it lacks policies/{gone[0]}")
         if not isinstance(info.get("versions", {}), dict):
             raise ValueError("its versions are no table")
-    except (
-        OSError,
-        LookupError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        StopIteration,
-        OverflowError,
-        csv.Error,
-    ) as error:
-        raise OffbenchError(
-            f"the ladder in {folder} is damaged ({error!r}); delete it and build it again with `offbench behaviour`"
-        ) from None
     return ladder
 
 

@@ -29,7 +29,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from offbench.errors import OffbenchError
-from offbench.files import write_bytes
+from offbench.files import damage, read_bytes, write_bytes
 
 if TYPE_CHECKING:
     from offbench.algorithm import PolicyParts  # brings PyTorch, which processes that play do without
@@ -192,11 +192,10 @@ def uniform(low: Array, high: Array, observation_dim: int, env_id: str) -> Polic
 def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Read a policy file. Raises OffbenchError if it is not one, or is damaged."""
     try:
-        return from_bytes(Path(path).read_bytes())
+        with damage(f"{path} is not a readable policy file", "give another, or write it again"):
+            return from_bytes(read_bytes(Path(path)))
     except FileNotFoundError:
         raise OffbenchError(f"no policy file {path}") from None
-    except (OSError, ValueError) as error:
-        raise OffbenchError(f"{path} is not a readable policy file: {error}") from None
 
 
 def from_bytes(data: bytes) -> Policy:

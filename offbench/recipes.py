@@ -18,6 +18,7 @@ from typing import Any
 
 from offbench.environments import env_spec
 from offbench.errors import OffbenchError, unknown
+from offbench.files import damage, read_text
 from offbench.settings import build, setting
 
 
@@ -106,11 +107,10 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
     """Read one recipe file. `folder` is where its behaviour weights are shipped, if they are."""
     where = str(path) if folder is None else f"recipe of {folder.name}"
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        with damage(f"{where}: not a readable TOML file", "correct it, or name another"):
+            values = tomllib.loads(read_text(path))
     except FileNotFoundError:
         raise OffbenchError(f"no recipe file {path}; write one, or name a shipped one: {', '.join(names())}") from None
-    except (OSError, ValueError, RecursionError) as error:  # not UTF-8, not TOML, a number of 5000 digits, a bomb
-        raise OffbenchError(f"{where}: not a readable TOML file ({error})") from None
     values.setdefault("name", path.stem if folder is None else folder.name)
     values["env_kwargs"] = _kwargs(values.pop("env_kwargs", {}), where)
     tables = {"sac": SACSettings, "measure": Measurement}

@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib.metadata
+import sys
+import types
 from typing import TYPE_CHECKING, cast
 
-from offbench.errors import OffbenchError, unknown
+from offbench.errors import SHOW_TRACEBACK, OffbenchError, unknown
 
 if TYPE_CHECKING:
     from offbench.algorithm import Algorithm
@@ -21,15 +23,32 @@ NEEDED = ("batch_size", "normalize")  # settings that the training itself reads
 @functools.cache
 def _entry_points() -> dict[str, list[importlib.metadata.EntryPoint]]:
     found: dict[str, list[importlib.metadata.EntryPoint]] = {}
-    for point in importlib.metadata.entry_points(group=GROUP):
-        if point not in (same := found.setdefault(point.name, [])):
-            same.append(point)
+    for package in importlib.metadata.distributions():
+        try:
+            points = package.entry_points.select(group=GROUP)
+        except Exception as error:  # a package whose metadata are damaged must not stop the others
+            print(f"offbench: warning: {package} has unreadable entry points ({error})", file=sys.stderr)
+            continue
+        for point in points:
+            if point not in (same := found.setdefault(point.name, [])):
+                same.append(point)
     return found
 
 
 def algorithm_names() -> list[str]:
     """Return the names of all installed algorithms, ours and third parties'."""
     return sorted(_entry_points())
+
+
+def is_third_party(trace: types.TracebackType | None) -> bool:
+    """Return whether a traceback leads through the package of an algorithm that is not offbench's own."""
+    packages = {point.module.partition(".")[0] for points in _entry_points().values() for point in points}
+    while trace is not None:
+        package = trace.tb_frame.f_globals.get("__name__", "").partition(".")[0]
+        if package in packages - {"offbench"}:
+            return True
+        trace = trace.tb_next
+    return False
 
 
 def load_algorithm(name: str) -> type[Algorithm]:
@@ -46,8 +65,9 @@ def load_algorithm(name: str) -> type[Algorithm]:
         raise OffbenchError(f"two algorithms are named {name!r}: {point.value} and {others[0].value}; rename yours")
     try:
         kind = point.load()
-    except (ImportError, AttributeError) as error:
-        raise OffbenchError(f"algorithm {name!r} ({point.value}) does not import: {error}") from error
+    except Exception as error:  # whatever its code raises
+        why = f"{type(error).__name__}: {error}"
+        raise OffbenchError(f"algorithm {name!r} ({point.value}) does not import: {why} ({SHOW_TRACEBACK})") from error
     config = getattr(kind, "Config", None)
     if not (isinstance(config, type) and dataclasses.is_dataclass(config)):
         raise OffbenchError(f"algorithm {name!r} ({point.value}): Config must be a dataclass of settings")

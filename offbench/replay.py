@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 
 from offbench.errors import OffbenchError
-from offbench.files import sha256, write_bytes
+from offbench.files import read_bytes, sha256, write_bytes
 from offbench.policy import Array
 from offbench.rollout import Episode
 
@@ -89,10 +89,10 @@ def load_replay(path: Path, expected_sha256: str, low: Array, high: Array, dtype
         OffbenchError: the file is missing or is not the one its ladder describes.
     """
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
     except OSError as error:
         raise OffbenchError(
-            f"cannot read {path}: {error.strerror}; build the ladder again with `offbench behaviour`"
+            f"cannot read {path}: {error.strerror or error}; build the ladder again with `offbench behaviour`"
         ) from None
     if sha256(data) != expected_sha256:
         raise OffbenchError(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from offbench.errors import OffbenchError
 from offbench.levels import LEVELS
 from offbench.runs import DIGITS, Run, find_runs
 from offbench.scores import mean_std, normalize, run_return, window
-from offbench.wording import counted
+from offbench.wording import counted, printable
 
 # the order of the BDB paper's Table 1; levels are in its order already
 ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
@@ -217,7 +218,7 @@ def read_results(root: str | Path) -> Results:
     """Read every run below a folder.
 
     Raises:
-        OffbenchError: none is evaluated, one is damaged, or one is there twice.
+        OffbenchError: none is evaluated, or one is there twice. Damaged runs are named on stderr and left out.
     """
     entries, waiting = entries_of(find_runs(Path(root)))
     if not entries:
@@ -239,18 +240,29 @@ def window_words(runs: Iterable[Trained]) -> str:
 def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
     """Return runs as entries in the order of the paper's table, and the runs that have no evaluation yet.
 
+    Damaged runs are named on stderr and left out.
+
     Raises:
-        OffbenchError: one is damaged, or there twice.
+        OffbenchError: one is there twice, or none but damaged ones is evaluated.
     """
     groups: dict[tuple[str, str, str, str], list[Trained]] = {}
     waiting = []
+    damaged: list[OffbenchError] = []
     for run in runs:
-        config, evaluations = run.config(), run.evaluations()
+        try:
+            config, evaluations = run.config(), run.evaluations()
+        except OffbenchError as error:
+            damaged.append(error)
+            continue
         if evaluations:
             key = (config["dataset"], config["dataset_sha256"], config["algorithm"], config["variant"])
             groups.setdefault(key, []).append(Trained(run, config, evaluations))
         else:
             waiting.append(run)
+    if damaged and not groups:
+        raise damaged[0]
+    for reason in damaged:
+        print(f"offbench: warning: left out: {printable(str(reason))}", file=sys.stderr)
     tasks = _tasks(groups)
     entries = []
     for (dataset, content, algorithm, variant), group in groups.items():

@@ -12,16 +12,27 @@ runs/<dataset>/<algorithm>/<variant>/seed-<n>/
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from offbench.errors import OffbenchError
-from offbench.files import csv_bytes, read_json, sha256, write_bytes, write_json
+from offbench.files import (
+    csv_bytes,
+    damage,
+    read_json,
+    regular,
+    remove_leftovers,
+    sha256,
+    sole,
+    write_bytes,
+    write_json,
+)
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 FORMAT = "offbench-run-1"
@@ -32,6 +43,8 @@ REQUIRED = {  # what a config.json must hold, and of which kind
     **dict.fromkeys(("seed", "steps"), int),
     **dict.fromkeys(("settings", "references"), dict),
 }
+LARGEST = 1e15  # what no step, return or reference reaches: scores and their squares stay finite
+SMALLEST_GAP = 1e-12  # between the references of a score
 MUST_MATCH = ("algorithm", "settings", "dataset", "dataset_sha256", "seed", "eval_every", "eval_episodes")
 
 
@@ -61,6 +74,13 @@ class Run:
         """The mean of each logged quantity."""
         return self.folder / "losses.csv"
 
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the directory for this process, rid of leftovers. Raises OffbenchError if another one trains it."""
+        with sole(self.folder / ".lock", f"{self.folder} is being trained"):
+            remove_leftovers(self.folder)
+            yield
+
     def config(self) -> dict[str, Any]:
         """Read config.json. Raises OffbenchError if it is missing or damaged."""
         if not self.config_path.exists():
@@ -79,7 +99,7 @@ class Run:
         config["references"] = {name: config["references"].get(name) for name in ("dataset", "d4rl")}
         for pair in config["references"].values():
             sound = isinstance(pair, list) and len(pair) == 2 and all(_is(value, float) for value in pair)
-            if pair is not None and not (sound and pair[0] < pair[1]):
+            if pair is not None and not (sound and pair[1] - pair[0] >= SMALLEST_GAP):
                 raise OffbenchError(f"{self.config_path} is damaged: odd references; delete the run to repeat it")
         return dict(config)
 
@@ -106,7 +126,11 @@ class Run:
         elif any(self.folder.glob("checkpoint-*.safetensors")):
             raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
         else:
-            write_json(self.config_path, config)
+            with self.locked():
+                if not self.config_path.exists():
+                    write_json(self.config_path, config)
+                    return
+            self.claim(config)  # another process was faster
 
     def begin(self, step: int, steps: int, made: Mapping[str, Any]) -> None:
         """Note in config.json that the run is trained from `step` to `steps`, and with what, if that has changed.
@@ -134,25 +158,34 @@ class Run:
         """Return {step: [(return, length) of each episode]} in order of steps; {} if there are none yet.
 
         Raises:
-            OffbenchError: the file is damaged.
+            OffbenchError: the file is damaged: a row is odd, an episode is missing or there twice, or the steps are
+                not those of config.json.
         """
         if not self.evaluations_path.exists():
             return {}
+        config = self.config() if self.config_path.exists() else {}
+        last, episodes = config.get("steps", LARGEST), config.get("eval_episodes")
         found: dict[int, list[tuple[float, int]]] = {}
-        try:
-            with open(self.evaluations_path, newline="", encoding="utf-8") as file:
+        with damage(f"{self.evaluations_path} is damaged", "delete the run to repeat it"):
+            with open(self.evaluations_path, newline="", encoding="utf-8", opener=regular) as file:
                 reader = csv.DictReader(file, strict=True)
                 if tuple(reader.fieldnames or ()) != EVALUATION_COLUMNS:
                     raise ValueError(f"its columns are {reader.fieldnames}")
                 for row in reader:
-                    if None in row.values():
-                        raise ValueError("a row is cut short")
-                    value = float(row["return"])
-                    if not math.isfinite(value):
+                    if None in row or None in row.values():
+                        raise ValueError(f"line {reader.line_num} has not {len(EVALUATION_COLUMNS)} cells")
+                    value, step = float(row["return"]), _count(row["step"])
+                    if not abs(value) < LARGEST:
                         raise ValueError(f"a return is {value}")
-                    found.setdefault(int(row["step"]), []).append((value, int(row["length"])))
-        except (OSError, ValueError, TypeError, csv.Error) as error:
-            raise OffbenchError(f"{self.evaluations_path} is damaged: {error}; delete the run to repeat it") from None
+                    if step > last:
+                        raise ValueError(f"step {step} of a run of {last} steps")
+                    rows = found.setdefault(step, [])
+                    if _count(row["episode"]) != len(rows):
+                        raise ValueError(f"episode {len(rows)} of step {step} is missing, or one is there twice")
+                    rows.append((value, _count(row["length"])))
+            for step, rows in found.items():
+                if len(rows) != (episodes or len(rows)):
+                    raise ValueError(f"step {step} has {len(rows)} episodes, not {episodes}")
         return dict(sorted(found.items()))
 
     def write_evaluations(self, evaluations: Mapping[int, list[tuple[float, int]]]) -> None:
@@ -175,18 +208,25 @@ class Run:
         path = self.losses_path
         if not path.exists():
             return []
-        try:
-            with open(path, newline="", encoding="utf-8") as file:
-                return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
-        except (OSError, ValueError, TypeError, csv.Error) as error:
-            raise OffbenchError(f"{path} is damaged: {error}; delete the run to repeat it") from None
+        with (
+            damage(f"{path} is damaged", "delete the run to repeat it"),
+            open(path, newline="", encoding="utf-8", opener=regular) as file,
+        ):
+            return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
+
+
+def _count(text: str) -> int:
+    """Return a whole number from 0 as offbench writes it."""
+    if not (text.isascii() and text.isdigit() and len(text) < 16):
+        raise ValueError(f"{text[:40]!r} is no step, episode or length")
+    return int(text)
 
 
 def _is(value: Any, kind: type) -> bool:
     """Return whether a JSON value is of a kind; numbers must be finite, and true is no number."""
     if kind in (int, float):
         kinds = int if kind is int else int | float
-        return isinstance(value, kinds) and not isinstance(value, bool) and abs(value) < 1e15
+        return isinstance(value, kinds) and not isinstance(value, bool) and abs(value) < LARGEST
     return isinstance(value, kind)
 
 
@@ -200,12 +240,18 @@ def sessions(config: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def find_runs(root: Path) -> list[Run]:
-    """Return all runs below a folder, in order of their paths; other programs' config.json are passed over."""
+    """Return all runs below a folder, in order of their paths; other programs' config.json are passed over.
+
+    A run whose config.json cannot be read is among them.
+    """
     return [Run(path.parent) for path in sorted(root.rglob("config.json")) if _is_run(path)]
 
 
 def _is_run(path: Path) -> bool:
-    config = read_json(path)
+    try:
+        config = read_json(path)
+    except OffbenchError:
+        return path.parent.name.startswith("seed-")
     return isinstance(config, dict) and config.get("format") == FORMAT
 
 
@@ -235,7 +281,9 @@ def variant(config: Any) -> str:
 def _word(value: Any) -> str:
     if isinstance(value, tuple):
         return "x".join(str(item) for item in value)
-    return f"{value:g}" if isinstance(value, float) else str(value).lower()
+    if isinstance(value, float):
+        return short if float(short := f"{value:g}") == value else repr(value)
+    return quote(value, safe="") if isinstance(value, str) else str(value).lower()
 
 
 def settings_dict(config: Any) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from offbench import checkpoints, seeds
 from offbench.checkpoints import keep_newest, load_newest, save_checkpoint
 from offbench.environments import make_env
 from offbench.errors import OffbenchError
-from offbench.files import csv_bytes, disk_errors, read_json, sole, write_bytes, write_json
+from offbench.files import csv_bytes, disk_errors, read_json, remove_leftovers, sole, write_bytes, write_json
 from offbench.policy import Array, Policy
 from offbench.progress import Progress
 from offbench.provenance import hardware, versions
@@ -72,6 +72,7 @@ def train(training: Training, steps: int) -> None:
         OffbenchError: the folder belongs to another recipe or seed, is in use, or the disk refuses.
     """
     with sole(training.folder / ".lock", f"{training.folder} is being trained"):
+        remove_leftovers(training.folder)
         _claim(training)
         if max(checkpoints.steps(training.folder), default=0) < steps:
             _train(training, steps)

@@ -204,6 +204,6 @@ def _config(order: Order, member: Member, schedule: Schedule, tf32: bool, comman
         },
         "env_id": data.env_id,
         "env_spec": data.env_spec,
-        "command": command,
+        "command": command.encode("utf-8", "backslashreplace").decode(),  # a path may hold bytes that are not UTF-8
         **made_with(schedule.device, tf32),
     }

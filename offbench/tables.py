@@ -19,6 +19,7 @@ from offbench.results import Entry, entries_of, read_results
 from offbench.runs import DIGITS, Run, find_runs
 from offbench.scores import normalize
 from offbench.statistics import iqm
+from offbench.wording import no_formula
 
 Row = dict[str, Any]
 FORMATS = ("table", "json", "csv", "markdown", "latex")
@@ -35,7 +36,7 @@ def score_runs(runs: str | Path = "runs") -> list[Row]:
     compare.
 
     Raises:
-        OffbenchError: the folder holds no evaluated run, or a damaged one.
+        OffbenchError: the folder holds no evaluated run. Damaged ones are named on stderr and left out.
     """
     return _rows(read_results(runs).entries.values())
 
@@ -45,9 +46,16 @@ def score_some(runs: Iterable[Run]) -> list[Row]:
     return _rows(entries_of(runs)[0])
 
 
-def count_waiting(rows: Sequence[Row], runs: str | Path) -> int:
-    """Return how many runs below a folder are not behind the rows of its table: they have no evaluation yet."""
-    return len(find_runs(Path(runs))) - sum(int(row["seeds"]) for row in rows)
+def count_waiting(runs: str | Path) -> int:
+    """Return how many runs below a folder have no evaluation yet; damaged ones are not counted."""
+    return sum(map(_is_waiting, find_runs(Path(runs))))
+
+
+def _is_waiting(run: Run) -> bool:
+    try:
+        return not run.evaluations()
+    except OffbenchError:
+        return False
 
 
 def _rows(entries: Collection[Entry]) -> list[Row]:
@@ -143,9 +151,8 @@ def render(rows: Sequence[Row], style: str = "table") -> str:
         return json.dumps(list(rows), indent=1)
     if style == "csv":
         text = io.StringIO()
-        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerows([list(rows[0]), *([no_formula(cell) for cell in row.values()] for row in rows)])
         return text.getvalue().rstrip("\n")
     keys = [key for key in rows[0] if TITLES.get(key, key) is not None]
     header = [TITLES.get(key, key) or key for key in keys]

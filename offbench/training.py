@@ -21,11 +21,10 @@ import numpy as np
 from offbench import checkpoints
 from offbench.algorithm import Algorithm
 from offbench.batches import Member
-from offbench.files import disk_errors, sole
+from offbench.files import disk_errors
 from offbench.loggers import NOWHERE, Destinations, Loggers
 from offbench.provenance import made_with
 from offbench.rollout import Outcome, Rollouts, result
-from offbench.runs import Run
 from offbench.scores import normalize
 from offbench.seeds import Purpose
 from offbench.stack import Stack, slice_of
@@ -93,7 +92,7 @@ class Trainer:
         with contextlib.ExitStack() as resources:
             self.stops = resources.enter_context(stops_noted(second_at_once=True))
             for member in self.members:
-                resources.enter_context(held(member.run))
+                resources.enter_context(member.run.locked())
             self._resume()
             for member in self.members:
                 member.run.begin(self.stack.step, self.schedule.steps, self.made)
@@ -246,10 +245,3 @@ class Trainer:
         if references is None:
             return f"return {np.mean(means):.0f}"
         return f"score {np.mean([normalize(mean, *references) for mean in means]):.1f}"
-
-
-@contextlib.contextmanager
-def held(run: Run) -> Iterator[None]:
-    """Hold a run's directory for this process. Raises OffbenchError if another one trains it."""
-    with sole(run.folder / ".lock", f"{run.folder} is being trained"):
-        yield

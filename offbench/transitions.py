@@ -10,6 +10,7 @@ episode's end   returns [E]
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -24,7 +25,7 @@ from typing import Any
 import gymnasium as gym
 import h5py
 import numpy as np
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
 from offbench import dataset
 from offbench.environments import box
@@ -242,9 +243,10 @@ def _convert(data: Any, dataset_id: str, observations: gym.spaces.Box, actions: 
     # each earlier episode put one extra observation row (its last) before this transition
     arrays["rows"] = np.arange(ends[-1]) + np.repeat(np.arange(len(lengths)), lengths)
     arrays |= {"ends": ends, "returns": np.array(returns)}
-    aside = folder.with_name(f".{folder.name}.{os.getpid()}")
+    aside = folder.with_name(f".{folder.name}.tmp")
     source = str(dataset.path_of(dataset_id))
     _forget(source)
+    _remove_leftovers(folder)
     aside.mkdir()
     try:
         for name in ARRAYS:
@@ -265,6 +267,17 @@ def _forget(source: str) -> None:
             continue
         if superseded:
             shutil.rmtree(meta.parent, ignore_errors=True)
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Delete what killed processes left of their conversions: `folder`'s, whose lock is held, and those unlocked."""
+    for aside in folder.parent.glob(".*"):
+        key = aside.name[1:].partition(".")[0]
+        if key == folder.name:
+            shutil.rmtree(aside, ignore_errors=True)
+        elif len(key) == len(folder.name) and aside.is_dir():
+            with contextlib.suppress(Timeout, OSError), FileLock(aside.with_name(f"{key}.lock"), timeout=0):
+                shutil.rmtree(aside, ignore_errors=True)
 
 
 def _episodes(data: Any, dataset_id: str) -> Iterator[Any]:

@@ -262,7 +262,6 @@ def test_divergence_is_said_and_the_last_checkpoint_kept(medium: str) -> None:
 
 
 def test_two_processes_cannot_train_the_same_run(medium: str) -> None:
-    from offbench.training import held
 
     (run,) = train("td3_bc", medium, "runs", 100)
     code = f"""
@@ -271,7 +270,7 @@ from offbench.cli import main
 main(["train", "td3_bc", "--dataset", {medium!r}, "--steps", "200", "--eval-every", "100", "--eval-episodes", "2",
       "--hidden", "16,16", "--batch-size", "32"])
 """
-    with held(run):
+    with run.locked():
         found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=dict(os.environ))
     assert found.returncode == 2
     assert f"is being trained by process {os.getpid()} on {socket.gethostname()}" in found.stderr

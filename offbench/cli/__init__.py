@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
-from typing import NoReturn
+from typing import Any, NoReturn, TextIO
 
 from offbench.cli import aids, data, results, training, travel
 from offbench.cli.arguments import Parser
-from offbench.errors import OffbenchError, unknown
+from offbench.errors import SHOW_TRACEBACK, OffbenchError, unknown
+from offbench.registry import is_third_party
+from offbench.wording import printable
 
 # What each does, and what adds its arguments.
 COMMANDS: dict[str, tuple[str, Callable[[Parser, list[str]], None]]] = {
@@ -55,18 +60,75 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        with _terminable():
+        with _terminable(), _printable_output():
             _run(words)
-    except OffbenchError as error:
-        print(f"offbench: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
     except KeyboardInterrupt as stop:
         goes_on = "; the same command goes on from the last checkpoint, or begins again if there is none yet"
         print(f"\noffbench: stopped{goes_on if _command(words) in RESUMED else ''}", file=sys.stderr)
         sys.exit(143 if isinstance(stop, Terminated) else 130)
     except BrokenPipeError:  # the reader of a pipe (`| head`) has left
+        _discard_output()
         sys.stderr.close()
         sys.exit(0)
+    except Exception as error:
+        if not isinstance(error, OffbenchError | OSError | MemoryError) and is_third_party(error.__traceback__):
+            raise  # whoever writes an algorithm needs its whole traceback
+        _discard_output()
+        if os.environ.get("OFFBENCH_TRACEBACK"):
+            traceback.print_exc()
+        print(f"offbench: {printable(' '.join(_line(error).split()))}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _line(error: Exception) -> str:
+    """Return what has gone wrong and what to do about it."""
+    if isinstance(error, OffbenchError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({error or 'for this command'}); close other programs, or ask for less"
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        remedy = "; raise the limit with `ulimit -n`" if error.errno in (errno.EMFILE, errno.ENFILE) else ""
+        return f"{where}{error.strerror or error}{remedy} ({SHOW_TRACEBACK})"
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    at = f"{frame.filename}:{frame.lineno}"
+    return f"this is a bug in offbench: {type(error).__name__}: {error} (at {at}); please report it; {SHOW_TRACEBACK}"
+
+
+class _Printable:
+    """A text stream that shows text of files as it is, and never obeys it or chokes on it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        encoding = self._stream.encoding or "utf-8"
+        return self._stream.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def _printable_output() -> Iterator[None]:
+    """Print to stdout through `_Printable`, and to the end: a full disk is met here, not when Python exits."""
+    if sys.stdout is None:  # closed by the shell
+        yield
+        return
+    with contextlib.redirect_stdout(_Printable(sys.stdout)):
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+
+
+def _discard_output() -> None:
+    """Drop what stdout could not write, or Python would try again at its exit."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Terminated(KeyboardInterrupt):

@@ -25,7 +25,7 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
 
         rows = normalize_runs_or_returns(**arguments)
         print(render(rows, style))
-        waiting = 0 if arguments["env"] else count_waiting(rows, arguments["runs"])
+        waiting = 0 if arguments["env"] else count_waiting(arguments["runs"])
         if waiting:
             verb = "has" if waiting == 1 else "have"
             print(f"{counted(waiting, 'run')} {verb} no evaluation yet", file=sys.stderr)

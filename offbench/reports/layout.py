@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from offbench.files import csv_bytes
 from offbench.tables import markdown
+from offbench.wording import no_formula
 
 SPECIAL = {
     "\\": r"\textbackslash{}",
@@ -75,7 +76,7 @@ class Table:
 
     def csv(self) -> bytes:
         """Return the table as CSV, text as shown."""
-        return csv_bytes(self.columns(), [[cell.full for cell in row] for row in self.rows])
+        return csv_bytes(self.columns(), [[no_formula(cell.full) for cell in row] for row in self.rows])
 
     def markdown(self) -> str:
         """Return title, table and notes as Markdown; the best in bold."""

@@ -24,6 +24,8 @@ from offbench.transitions import open_minari
 from tests.conftest import ROOT
 
 KILLS = {"collect": 80, "overwrite": 60, "import": 40, "train": 100}  # at least 200 over collect and train
+if total := int(os.environ.get("OFFBENCH_KILLS", "0")):  # as many in all
+    KILLS = {kind: -(-total * count // sum(KILLS.values())) for kind, count in KILLS.items()}
 RUN = ["--steps", "160", "--eval-every", "40", "--eval-episodes", "1", "--hidden", "16,16", "--batch-size", "16"]
 
 

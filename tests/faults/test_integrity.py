@@ -1,0 +1,226 @@
+"""Runs that move, rows that repeat, text that commands: each is refused, named or made harmless."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from offbench import files, tables
+from offbench.cli import main
+from offbench.errors import OffbenchError
+from offbench.runs import Run, find_runs, variant
+from offbench.settings import setting
+from offbench.wording import no_formula, printable
+from tests.test_bad_input import refusal
+
+ROWS = "step,episode,return,length\n100,0,1.0,5\n100,1,2.0,5\n200,0,3.0,5\n200,1,4.0,5\n"
+
+
+def trained(folder: Path, rows: str = ROWS, references: list[float] | None = None) -> Run:
+    """Write a run of two evaluations of two episodes."""
+    seed = int(folder.name.removeprefix("seed-"))
+    folder.mkdir(parents=True)
+    config = {
+        "format": "offbench-run-1",
+        "algorithm": "bc",
+        "variant": "default",
+        "settings": {},
+        "dataset": "a-random-v0",
+        "dataset_sha256": "0",
+        "seed": seed,
+        "steps": 200,
+        "eval_episodes": 2,
+        "references": {"dataset": references or [0.0, 10.0]},
+    }
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "evaluations.csv").write_text(rows)
+    return Run(folder)
+
+
+def test_a_lock_whose_folder_is_moved_stops_every_write(tmp_path: Path) -> None:
+    run = Run(tmp_path / "run")
+    with run.locked():
+        run.write_losses([{"step": 1.0}])
+        run.folder.rename(tmp_path / "moved")
+        with pytest.raises(OffbenchError, match="moved, deleted or replaced"):
+            run.write_losses([{"step": 2.0}])
+    assert not run.folder.exists()
+    assert Run(tmp_path / "moved").losses() == [{"step": 1.0}]
+
+
+def test_a_lock_whose_folder_is_replaced_leaves_the_new_owner_alone(tmp_path: Path) -> None:
+    run = Run(tmp_path / "run")
+    with run.locked():
+        shutil.rmtree(run.folder)
+        run.folder.mkdir()
+        (run.folder / ".lock").touch()  # as another trainer would
+        (run.folder / ".holder").write_text("process 1 on another")
+        with pytest.raises(OffbenchError, match="moved, deleted or replaced"):
+            run.write_losses([{"step": 1.0}])
+    assert [path.name for path in sorted(run.folder.iterdir())] == [".holder", ".lock"]
+
+
+def test_leftovers_of_any_process_are_removed_under_the_lock(tmp_path: Path) -> None:
+    run = trained(tmp_path / "seed-0")
+    for pid in (1, os.getpid(), 999_999):
+        (run.folder / f".policy.safetensors.{pid}.tmp").write_bytes(b"half")
+    with run.locked():
+        assert not list(run.folder.glob("*.tmp"))
+        assert not list(run.folder.glob(".*.tmp"))
+
+
+@pytest.mark.parametrize(
+    ("rows", "names"),
+    [
+        (ROWS + "200,0,99999.0,5\n", "twice"),
+        (ROWS + "-7,0,1.0,5\n", "-7"),
+        (ROWS + "9" * 400 + ",0,1.0,5\n", "999"),
+        (ROWS + "300,0,1.0,5\n300,1,1.0,5\n", "step 300"),
+        (ROWS.replace("200,1,4.0,5\n", "200,1,4.0,5,6\n"), "cells"),
+        (ROWS.replace("200,1,4.0,5\n", ""), "step 200 has 1"),
+        (ROWS.replace("100,0,1.0,5\n", ""), "step 100"),
+        (ROWS.replace("4.0", "1e308"), "1e+308"),
+        (ROWS.replace("4.0", "nan"), "nan"),
+    ],
+)
+def test_rows_that_do_not_fit_their_key_are_damage(
+    tmp_path: Path, rows: str, names: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A damaged run alone is refused; beside a sound one it is named and left out."""
+    trained(tmp_path / "seed-1", rows)
+    assert names in refusal(["normalize", "--runs", str(tmp_path)], capsys)
+    trained(tmp_path / "seed-0")
+    (row,) = tables.score_runs(tmp_path)
+    assert row["seeds"] == 1
+    assert row["score"] == pytest.approx(25.0)  # mean of 1, 2, 3, 4 between 0 and 10
+    said = capsys.readouterr().err
+    assert str(tmp_path / "seed-1" / "evaluations.csv") in said
+    assert names in said
+
+
+@pytest.mark.parametrize("references", [[0, 5e-324], [0, 1e-300], [-1e308, 1e308], [1.0, 1.0]])
+def test_references_beyond_reason_are_damage(
+    tmp_path: Path, references: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    trained(tmp_path / "seed-0", references=references)
+    assert "references" in refusal(["normalize", "--runs", str(tmp_path)], capsys)
+
+
+def test_a_run_with_an_unreadable_config_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trained(tmp_path / "seed-0")
+    (trained(tmp_path / "seed-1").folder / "config.json").write_text("{")
+    assert len(find_runs(tmp_path)) == 2
+    assert tables.score_runs(tmp_path)[0]["seeds"] == 1
+    assert "seed-1/config.json" in capsys.readouterr().err
+
+
+def test_variants_keep_every_digit_and_letter() -> None:
+    @dataclass(frozen=True)
+    class Config:
+        rate: float = setting(1.0, "")
+        mode: str = setting("a", "")
+
+    names = [
+        variant(Config(rate, mode)) for rate in (0.00012345678, 0.00012345679) for mode in ("B", "b", "x/y", "x,y")
+    ]
+    assert len({name.lower() if "mode=b" not in name.lower() else name for name in names}) == 8
+    assert not any("/" in name for name in names)
+    assert variant(Config(0.0003)) == "rate=0.0003"  # as ever
+
+
+def test_escape_sequences_are_shown_not_obeyed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = trained(tmp_path / "seed-0")
+    config = json.loads(run.config_path.read_text()) | {"dataset": "\x1b]0;owned\x07\x1b[2J\u202e"}
+    run.config_path.write_text(json.dumps(config))
+    main(["normalize", "--runs", str(tmp_path)])
+    shown = capsys.readouterr().out
+    assert "\\x1b[2J" in shown
+    assert not set(shown) & set("\x1b\x07\u202e")
+    assert printable("a\tb\n±é") == "a\tb\n±é"
+
+
+@pytest.mark.parametrize("cell", ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\t=1"])
+def test_no_cell_is_a_formula(cell: str) -> None:
+    text = tables.render([{"dataset": cell, "return": -1.5}], "csv")
+    header, row = csv.reader(io.StringIO(text))
+    assert (header, row) == (["dataset", "return"], ["'" + cell, "-1.5"])
+    assert no_formula("-1.5") == "-1.5"
+
+
+def test_a_fifo_is_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It would be waited for without end."""
+    for name in ("grid.toml", "recipe.toml", "policy.safetensors"):
+        os.mkfifo(tmp_path / name)
+    for words in (["benchmark", "grid.toml"], ["collect", "recipe.toml"], ["evaluate", "policy.safetensors"]):
+        line = refusal([words[0], str(tmp_path / words[1])], capsys)
+        assert words[1] in line
+        assert "not a regular file" in line
+
+
+def offbench(*words: str, before: str = "", **how: str) -> subprocess.CompletedProcess[str]:
+    command = f'{before} exec "$0" -m offbench "$@"'
+    environment = os.environ | how
+    return subprocess.run(
+        ["sh", "-c", command, sys.executable, *words], env=environment, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_behind_stdout_is_one_line() -> None:
+    found = offbench("list", before="exec >/dev/full;")
+    assert found.returncode == 2
+    assert len(found.stderr.splitlines()) == 1
+    assert "No space left" in found.stderr
+
+
+def test_odd_terminals_get_what_they_can_show() -> None:
+    assert offbench("list", PYTHONIOENCODING="ascii").returncode == 0
+    assert offbench("list", before="exec >&-;").returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("error", "names"),
+    [
+        (MemoryError("Unable to allocate 8 EiB"), "8 EiB"),
+        (OSError(24, "Too many open files", "a.csv"), "ulimit -n"),
+        (ZeroDivisionError("by zero"), "bug in offbench"),
+        (RecursionError("too deep"), "bug in offbench"),
+    ],
+)
+def test_whatever_a_command_raises_is_one_line(
+    error: Exception, names: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr("offbench.describe.inventory_lines", fail)
+    assert names in refusal(["list"], capsys)
+    monkeypatch.setenv("OFFBENCH_TRACEBACK", "1")
+    with pytest.raises(SystemExit):
+        main(["list"])
+    assert "in fail" in capsys.readouterr().err
+
+
+def test_an_error_in_an_algorithm_of_ones_own_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("offbench.describe.inventory_lines", fail)
+    monkeypatch.setattr("offbench.cli.is_third_party", lambda trace: trace is not None)
+    with pytest.raises(ZeroDivisionError):
+        main(["list"])
+
+
+def test_damage_brings_no_error_of_a_parser_out() -> None:
+    for error in (MemoryError(), RecursionError(), KeyError("x"), StopIteration(), AssertionError("odd")):
+        with pytest.raises(OffbenchError, match="delete it"), files.damage("a.bin is damaged", "delete it"):
+            raise error
