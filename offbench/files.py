@@ -54,9 +54,9 @@ def sole(lock: Path, what: str, patience: float = ORPHANS) -> Iterator[None]:
         except Timeout:
             raise OffbenchError(f"{what} by {_holder(holder)}; wait for it, or stop it") from None
     try:
+        _held[lock] = lock.stat().st_ino  # no new file gets this number while the lock is open
         with disk_errors(str(lock.parent)):
             holder.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
-        _held[lock] = lock.stat().st_ino  # no new file gets this number while the lock is open
         yield
     finally:
         if _is_ours(lock):  # else the holder file is another process's
