@@ -19,7 +19,7 @@ def scores(
 ) -> None:
     """Write one run a seed; the made runs' own reference is 0 to 100, so a return is a score."""
     for seed, value in enumerate(values):
-        made_run(root, dataset, algorithm, variant, seed, 0).write_evaluations({30_000: [(value, 5)]})
+        made_run(root, dataset, algorithm, variant, seed, 0).write_evaluations({30_000: [(value, 5)] * 3})
 
 
 def test_three_seeds_by_hand(home: Path) -> None:
@@ -86,7 +86,7 @@ def test_unequal_training_is_said(home: Path) -> None:
     scores(home / "runs", "td3_bc", [50.0, 50.0])
     for seed in range(2):
         run = made_run(home / "runs", "hopper-medium-v0", "cql", "default", seed, 0)
-        run.write_evaluations({3000: [(40.0, 5)]})
+        run.write_evaluations({3000: [(40.0, 5)] * 3})
     text = "\n".join(offbench.compare("td3_bc", "cql").lines())
     assert "evaluated at different steps: td3_bc 1 evaluation, step 30,000; cql 1 evaluation, step 3,000" in text
     assert "no verdict" in text
@@ -105,7 +105,7 @@ def test_a_variant_may_be_named_as_tables_name_it(home: Path) -> None:
     scores(home / "runs", "td3_bc", [1.0])
     for seed, value in enumerate([2.0, 3.0]):
         run = made_run(home / "runs", "hopper-medium-v0", "bdb", "default", seed, 0, settings={"beta": "adaptive"})
-        run.write_evaluations({30_000: [(value, 5)]})
+        run.write_evaluations({30_000: [(value, 5)] * 3})
     assert compare("bdb/beta=adaptive", "td3_bc", runs="runs").a == "bdb beta=adaptive"
     with pytest.raises(OffbenchError, match=r"cql has no evaluated runs here; bdb, td3_bc have"):
         compare("cql", "td3_bc", runs="runs")

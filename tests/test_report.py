@@ -58,9 +58,9 @@ def test_a_whole_grid(home: Path) -> None:
 def test_the_score_table_by_hand(home: Path) -> None:
     for seed, value in enumerate((40.0, 50.0, 90.0)):
         run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", seed, 0)
-        run.write_evaluations({30_000: [(value, 5)]})
+        run.write_evaluations({30_000: [(value, 5)] * 3})
     run = made_run(home / "runs", "hopper-medium-v0", "bdb", "default", 0, 0, settings={"beta": "adaptive"})
-    run.write_evaluations({30_000: [(70.0, 5)]})
+    run.write_evaluations({30_000: [(70.0, 5)] * 3})
     offbench.report(home / "runs", home / "out")
     ((row),) = rows(home / "out" / "tables" / "scores.csv")
     assert row["level"] == "medium"
@@ -88,9 +88,9 @@ def test_scores_of_different_evaluations_are_not_ranked(home: Path, capsys: pyte
     for dataset, steps in {"hopper-medium-v0": (500,), "hopper-expert-v0": (500, 1000, 1500, 2000)}.items():
         for seed in range(6):
             run = made_run(home / "runs", dataset, "td3_bc", "default", seed, 0)
-            run.write_evaluations({step: [(10.0 + step / 100, 5)] for step in (500, 1000, 1500, 2000)})
+            run.write_evaluations({step: [(10.0 + step / 100, 5)] * 3 for step in (500, 1000, 1500, 2000)})
             run = made_run(home / "runs", dataset, "bc", "default", seed, 0)
-            run.write_evaluations({step: [(90.0, 5)] for step in steps})
+            run.write_evaluations({step: [(90.0, 5)] * 3 for step in steps})
     offbench.report(home / "runs", home / "out")
     medium, expert = [line for line in (home / "out/tables/scores.md").read_text().splitlines() if "hopper" in line]
     assert "**" not in medium
@@ -261,7 +261,7 @@ def test_bold_improvement_is_compares_verdict(home: Path, seeds: int) -> None:
     for algorithm, value in (("td3_bc", 90.0), ("cql", 10.0)):
         for seed in range(seeds):
             run = made_run(home / "runs", "hopper-medium-v0", algorithm, "default", seed, 0)
-            run.write_evaluations({30_000: [(value + seed, 5)]})
+            run.write_evaluations({30_000: [(value + seed, 5)] * 3})
     offbench.report(home / "runs", home / "out")
     evidence = "no evidence" not in offbench.compare("td3_bc", "cql").verdict
     assert evidence == (seeds == 6)  # two seeds of one dataset have p = 1/2, six 1/32

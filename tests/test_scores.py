@@ -73,7 +73,7 @@ def write_run(
         "seed": seed,
     }
     references = {"dataset": [0.0, 200.0], "d4rl": d4rl}
-    config |= {"settings": {}, "dataset_sha256": content, "eval_every": 100, "eval_episodes": 3}
+    config |= {"settings": {}, "dataset_sha256": content, "eval_every": 100, "eval_episodes": len(returns)}
     run.folder.mkdir(parents=True)
     run.claim(config | {"references": references, "steps": 100})
     if returns:
