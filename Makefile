@@ -20,7 +20,7 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
-# More of what is random in the tests of faults: kills in all, and spoiled files for each of the ten readers.
+# More of what is random in the tests of faults: kills in all, and spoiled files for each reader.
 KILLS ?= 1000
 FUZZ ?= 100000
 nightly: $(STAMP)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import errno
 import hashlib
 import io
 import json
@@ -18,6 +19,8 @@ from filelock import FileLock, Timeout
 
 from offbench.errors import OffbenchError
 
+# errno to remedy
+OPEN_FILES: dict[int | None, str] = dict.fromkeys((errno.EMFILE, errno.ENFILE), "raise the limit with `ulimit -n`")
 ORPHANS = 3.0  # seconds to wait for a lock: processes whose parent was killed notice it within one
 
 
@@ -29,8 +32,8 @@ def disk_errors(what: str) -> Iterator[None]:
     except OSError as error:
         if isinstance(error, FileNotFoundError | BrokenPipeError):
             raise
-        reason = error.strerror or str(error)
-        raise OffbenchError(f"cannot write {what}: {reason}; free some room or choose another folder") from error
+        remedy = OPEN_FILES.get(error.errno, "free some room or choose another folder")
+        raise OffbenchError(f"cannot write {what}: {error.strerror or error}; {remedy}") from error
 
 
 @contextlib.contextmanager

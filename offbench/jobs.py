@@ -13,7 +13,6 @@ import contextlib
 import multiprocessing
 import os
 import time
-import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -24,7 +23,7 @@ from offbench import transitions
 from offbench.batches import Member
 from offbench.errors import OffbenchError
 from offbench.progress import Progress
-from offbench.registry import load_algorithm
+from offbench.registry import failure, load_algorithm
 from offbench.runs import Run
 from offbench.settings import build
 from offbench.training import STOPPED, Report, Schedule, Trainer
@@ -252,7 +251,6 @@ def _work(job: Job, pipe: Connection, parent: int) -> None:
         lines = perform(job, lambda step, note: pipe.send((step, note, None)))
     except OffbenchError as error:
         lines = [str(error)]
-    except Exception:
-        # a fault of ours or of a third party's algorithm: the parent shows it whole
-        lines = [f"{job.title}: {traceback.format_exc()}"]
+    except Exception as error:
+        lines = [f"{job.title}: {failure(error)}"]
     pipe.send((None, "", lines))

@@ -5,11 +5,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib.metadata
+import os
 import sys
+import traceback
 import types
 from typing import TYPE_CHECKING, cast
 
 from offbench.errors import SHOW_TRACEBACK, OffbenchError, unknown
+from offbench.files import OPEN_FILES
 
 if TYPE_CHECKING:
     from offbench.algorithm import Algorithm
@@ -40,15 +43,40 @@ def algorithm_names() -> list[str]:
     return sorted(_entry_points())
 
 
-def is_third_party(trace: types.TracebackType | None) -> bool:
-    """Return whether a traceback leads through the package of an algorithm that is not offbench's own."""
+def failure(error: Exception) -> str:
+    """Return what has gone wrong and what to do about it, whatever was raised.
+
+    The traceback goes to stderr if $OFFBENCH_TRACEBACK is set, or if an installed algorithm has the fault: whoever
+    writes one needs it.
+    """
+    expected = isinstance(error, OffbenchError | OSError | MemoryError)
+    algorithm = None if expected else _third_party(error.__traceback__)
+    if algorithm or os.environ.get("OFFBENCH_TRACEBACK"):
+        traceback.print_exception(error)
+    if isinstance(error, OffbenchError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({error or 'for this command'}); close other programs, or ask for less"
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        remedy = f"; {OPEN_FILES[error.errno]}" if error.errno in OPEN_FILES else ""
+        return f"{where}{error.strerror or error}{remedy} ({SHOW_TRACEBACK})"
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    what = f"{type(error).__name__}: {error} (at {frame.filename}:{frame.lineno})"
+    if algorithm:
+        return f"an error in the package {algorithm}: {what}; see the traceback above"
+    return f"this is a bug in offbench: {what}; please report it; {SHOW_TRACEBACK}"
+
+
+def _third_party(trace: types.TracebackType | None) -> str | None:
+    """Return the package of an algorithm, not offbench's own, that a traceback leads through."""
     packages = {point.module.partition(".")[0] for points in _entry_points().values() for point in points}
     while trace is not None:
-        package = trace.tb_frame.f_globals.get("__name__", "").partition(".")[0]
+        package = str(trace.tb_frame.f_globals.get("__name__", "")).partition(".")[0]
         if package in packages - {"offbench"}:
-            return True
+            return package
         trace = trace.tb_next
-    return False
+    return None
 
 
 def load_algorithm(name: str) -> type[Algorithm]:

@@ -31,7 +31,7 @@ from offbench.errors import OffbenchError
 from offbench.policy import Array, Policy, from_bytes
 from offbench.scores import interval
 from offbench.seeds import Purpose
-from offbench.workers import closing, quiet_start, start_worker
+from offbench.workers import closing, quiet_start, start_errors, start_worker
 
 LANES = 16  # episodes that share a policy forward
 TASK = 16  # episodes that travel together
@@ -198,8 +198,9 @@ class Rollouts:
         self._pool: ProcessPoolExecutor | None = None
         if workers:
             context = multiprocessing.get_context("spawn")
-            self._closing = context.RawValue("b", 0)  # no lock, which a killed worker could hold for ever
-            self._pool = ProcessPoolExecutor(workers, context, start_worker, (os.getpid(), self._closing))
+            with start_errors():
+                self._closing = context.RawValue("b", 0)  # no lock, which a killed worker could hold for ever
+                self._pool = ProcessPoolExecutor(workers, context, start_worker, (os.getpid(), self._closing))
 
     def __enter__(self) -> Rollouts:
         return self

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import signal
 import sys
@@ -13,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from offbench.errors import OffbenchError
+from offbench.files import OPEN_FILES
 
 STOPS = {signal.SIGINT, signal.SIGTERM}
 LAST = 2.0  # seconds that a worker has to end when its pool closes
@@ -34,6 +36,17 @@ def default_workers(workers: int | None) -> int:
 
 
 @contextlib.contextmanager
+def start_errors() -> Iterator[None]:
+    """Turn the operating system's refusals to start a process, or to share memory with it, into one line."""
+    try:
+        yield
+    except OSError as error:
+        full = error.errno == errno.ENOSPC
+        remedy = OPEN_FILES.get(error.errno, "free some room in /dev/shm" if full else "use fewer --workers")
+        raise OffbenchError(f"cannot start a worker process: {error.strerror or error}; {remedy}") from error
+
+
+@contextlib.contextmanager
 def quiet_start() -> Iterator[None]:
     """Let a worker start undisturbed: submitting a task may start one.
 
@@ -43,7 +56,7 @@ def quiet_start() -> Iterator[None]:
     """
     script = sys.modules["__main__"]
     threads = {name: "1" for name in THREADS if name not in os.environ}
-    with _held_back():
+    with start_errors(), _held_back():
         sys.modules["__main__"] = types.ModuleType("__main__")
         os.environ |= threads
         try:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import signal
 import sys
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
 from offbench.cli import aids, data, results, training, travel
 from offbench.cli.arguments import Parser
-from offbench.errors import SHOW_TRACEBACK, OffbenchError, unknown
-from offbench.registry import is_third_party
+from offbench.errors import unknown
+from offbench.registry import failure
 from offbench.wording import printable
 
 # What each does, and what adds its arguments.
@@ -71,28 +69,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.stderr.close()
         sys.exit(0)
     except Exception as error:
-        if not isinstance(error, OffbenchError | OSError | MemoryError) and is_third_party(error.__traceback__):
-            raise  # whoever writes an algorithm needs its whole traceback
         _discard_output()
-        if os.environ.get("OFFBENCH_TRACEBACK"):
-            traceback.print_exc()
-        print(f"offbench: {printable(' '.join(_line(error).split()))}", file=sys.stderr)
+        print(f"offbench: {printable(' '.join(failure(error).split()))}", file=sys.stderr)
         sys.exit(2)
-
-
-def _line(error: Exception) -> str:
-    """Return what has gone wrong and what to do about it."""
-    if isinstance(error, OffbenchError):
-        return str(error)
-    if isinstance(error, MemoryError):
-        return f"not enough memory ({error or 'for this command'}); close other programs, or ask for less"
-    if isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename else ""
-        remedy = "; raise the limit with `ulimit -n`" if error.errno in (errno.EMFILE, errno.ENFILE) else ""
-        return f"{where}{error.strerror or error}{remedy} ({SHOW_TRACEBACK})"
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    at = f"{frame.filename}:{frame.lineno}"
-    return f"this is a bug in offbench: {type(error).__name__}: {error} (at {at}); please report it; {SHOW_TRACEBACK}"
 
 
 class _Printable:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from offbench import files, tables
+from offbench import collect, files, registry, tables
 from offbench.cli import main
 from offbench.errors import OffbenchError
 from offbench.runs import Run, find_runs, variant
@@ -182,6 +182,27 @@ def test_a_full_disk_behind_stdout_is_one_line() -> None:
     assert "No space left" in found.stderr
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="`ulimit -n` of other systems begins elsewhere")
+def test_few_file_descriptors_are_one_line() -> None:
+    found = offbench("collect", "inverted-pendulum", "--level", "random", "--steps", "300", before="ulimit -n 14;")
+    assert found.returncode == 2
+    assert len(found.stderr.splitlines()) == 1, found.stderr
+    assert "ulimit -n" in found.stderr
+
+
+def test_full_shared_memory_is_one_line() -> None:
+    own = ["unshare", "-m", "sh", "-c"]
+    full = "mount -t tmpfs -o size=4k,nr_inodes=1 tmpfs /dev/shm"
+    if not shutil.which("unshare") or subprocess.run([*own, full], capture_output=True, check=False).returncode:
+        pytest.skip("needs the right to mount a small tmpfs at /dev/shm")
+    words = ["-m", "offbench", "collect", "inverted-pendulum", "--level", "random", "--steps", "300"]
+    command = [*own, f'{full}; exec "$0" "$@"', sys.executable, *words]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert found.returncode == 2
+    assert len(found.stderr.splitlines()) == 1, found.stderr
+    assert "/dev/shm" in found.stderr
+
+
 def test_odd_terminals_get_what_they_can_show() -> None:
     assert offbench("list", PYTHONIOENCODING="ascii").returncode == 0
     assert offbench("list", before="exec >&-;").returncode == 0
@@ -210,14 +231,37 @@ def test_whatever_a_command_raises_is_one_line(
     assert "in fail" in capsys.readouterr().err
 
 
-def test_an_error_in_an_algorithm_of_ones_own_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail() -> None:
-        raise ZeroDivisionError
+MINE = """
+from offbench.algos.bc import BC
 
-    monkeypatch.setattr("offbench.describe.inventory_lines", fail)
-    monkeypatch.setattr("offbench.cli.is_third_party", lambda trace: trace is not None)
-    with pytest.raises(ZeroDivisionError):
-        main(["list"])
+class Mine(BC):
+    def update(self, *_, **__):
+        raise ZeroDivisionError("of mine")
+"""
+
+
+@pytest.mark.parametrize("processes", ["1", "2"])
+def test_an_error_in_an_installed_algorithm_keeps_its_traceback(
+    processes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """In this process, and in the worker processes of two runs."""
+    package = tmp_path / "mine-1.0.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (package / "entry_points.txt").write_text("[offbench.algos]\nmine = mine:Mine\n")
+    (tmp_path / "mine.py").write_text(MINE)
+    monkeypatch.syspath_prepend(tmp_path)
+    registry._entry_points.cache_clear()
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    dataset = collect("inverted-pendulum", "random", steps=300, workers=1)
+    words = ["--seeds", "0:" + processes, "--workers", processes, "--steps", "2", "--hidden", "8", "--batch-size", "8"]
+    with pytest.raises(SystemExit) as stopped:
+        main(["train", "mine", "--dataset", dataset, *words])
+    registry._entry_points.cache_clear()
+    said = capfd.readouterr().err
+    assert stopped.value.code == 2
+    assert 'mine.py", line 6, in update' in said
+    assert "the package mine: ZeroDivisionError: of mine" in said.splitlines()[-1]
 
 
 def test_damage_brings_no_error_of_a_parser_out() -> None:
