@@ -16,6 +16,7 @@ import shutil
 import socket
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -28,7 +29,6 @@ from offbench.files import write_bytes
 from offbench.grid import Source
 from offbench.jobs import Board, Job, Order, is_over, perform
 from offbench.record import record_source
-from offbench.registry import failure
 from offbench.runs import Run
 from offbench.stacking import finished
 
@@ -281,5 +281,7 @@ def _task(work: Callable[[], list[str]], title: str) -> tuple[bool, list[str]]:
     """Return whether the work can go on, and what went wrong."""
     try:
         return True, work()
-    except Exception as error:
-        return False, [f"{title}: {failure(error)}"]
+    except OffbenchError as error:
+        return False, [f"{title}: {error}"]
+    except Exception:  # a fault of ours or of a third party's algorithm: the driver shows it whole
+        return False, [f"{title}: {traceback.format_exc()}"]
