@@ -22,6 +22,7 @@ from offbench.rollout import Rollouts, result
 from offbench.runs import Run
 from offbench.scores import interval, normalize
 from offbench.seeds import Purpose, generator
+from offbench.trust import REMEDY, is_trusting
 from offbench.wording import counted
 from offbench.workers import default_workers
 
@@ -155,10 +156,12 @@ def similarity(
 def _registered(env_id: str, path: Path) -> str:
     """Return a policy file's `env_id` without the module before its colon, which Gymnasium would import."""
     module, _, name = env_id.rpartition(":")
+    if module and is_trusting():
+        return env_id
     if module and name not in gym.registry:
         raise OffbenchError(
             f"{path} names its environment as {env_id!r}, and a module that a file names is not imported; "
-            "give the recipe of the environment with --env"
+            f"give the recipe of the environment with --env, or {REMEDY}"
         )
     return name
 

@@ -5,7 +5,6 @@ An EnvSpec names the code that makes the environment, so one that came in a file
 
 from __future__ import annotations
 
-import importlib
 import json
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from offbench.errors import OffbenchError
+from offbench.trust import check_code
 
 WHAT_MATTERS = ("id", "kwargs", "max_episode_steps")  # what makes two specs the same environment
 
@@ -69,26 +69,6 @@ def believed_env(text: str, where: str) -> gym.Env[Any, Any]:
         raise OffbenchError(
             f"{where}: cannot make its environment: {_reason(error)}; install or import the package it comes from"
         ) from error
-
-
-def check_code(spec: EnvSpec) -> None:
-    """Refuse entry points that are no environments: `os:system` would run whatever a file says.
-
-    Raises:
-        OffbenchError: what it names is no environment or wrapper class.
-    """
-    registered = gym.registry.get(spec.id)
-    if registered is None or registered.entry_point != spec.entry_point:
-        _check_class(spec.entry_point, gym.Env)
-    for wrapper in spec.additional_wrappers:
-        _check_class(wrapper.entry_point, gym.Wrapper)
-
-
-def _check_class(entry_point: Any, base: type) -> None:
-    module, _, name = str(entry_point).partition(":")
-    found = getattr(importlib.import_module(module), name, None)
-    if not (isinstance(found, type) and issubclass(found, base)):
-        raise OffbenchError(f"its entry point {entry_point!r} is no {base.__name__} class, it is not run")
 
 
 def make_env(spec: str) -> gym.Env[Any, Any]:

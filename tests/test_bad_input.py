@@ -299,12 +299,12 @@ def test_a_full_disk_is_seen_before_recording(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"entry_point": "os:system", "kwargs": {"command": "touch PWNED"}, "id": "Evil-v0"}, "is no Env class"),
-        ({"entry_point": "no_such_module:Env", "id": "Gone-v0"}, "cannot make its environment"),
+        ({"entry_point": "os:system", "kwargs": {"command": "touch PWNED"}, "id": "Evil-v0"}, "os:system.*--trust"),
+        ({"entry_point": "no_such_module:Env", "id": "Gone-v0"}, "no_such_module:Env.*--trust"),
         ({"id": "Hopper-v5", "entry_point": "gymnasium.envs.mujoco.hopper_v5:HopperEnv"}, "has \\(11,\\) and"),
         (
             {"additional_wrappers": [{"name": "x", "entry_point": "os:system", "kwargs": {"command": "touch PWNED"}}]},
-            "is no Wrapper class",
+            "os:system.*--trust",
         ),
     ],
 )

@@ -339,7 +339,7 @@ def test_code_named_by_the_metadata_is_not_run(medium: str, home: Path) -> None:
     spec = json.loads(env_spec("InvertedPendulum-v5"))
     evil = json.dumps(spec | {"id": "Evil-v0", "entry_point": "os:system", "kwargs": {"command": "touch PWNED"}})
     change_metadata(medium, env_spec=evil)
-    assert any("is no Env class" in line for line in verify(medium, workers=1).skipped)
+    assert any("os:system" in line for line in verify(medium, workers=1).skipped)
     metadata = json.loads(metadata_path(medium).read_text())
     del metadata["observation_space"]
     metadata_path(medium).write_text(json.dumps(metadata))

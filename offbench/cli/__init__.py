@@ -148,6 +148,10 @@ def _run(words: list[str]) -> None:
         parser.print_help()
         return
     run: Callable[..., None] = arguments.pop("run")
+    if arguments.pop("trust", False):
+        from offbench.trust import trusting
+
+        run = trusting()(run)
     run(**arguments)
 
 

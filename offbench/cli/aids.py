@@ -6,7 +6,7 @@ import sys
 from json import dumps
 from typing import Any
 
-from offbench.cli.arguments import Parser, natural, number, whole
+from offbench.cli.arguments import Parser, natural, number, trust, whole
 
 
 def video_arguments(parser: Parser, _: list[str]) -> None:
@@ -19,6 +19,7 @@ def video_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
     parser.add_argument("--fps", type=whole, default=25, help="frames a second (default: 25)")
     parser.add_argument("--size", type=whole, default=480, help="longer side in pixels (default: 480)")
+    trust(parser)
 
     def run(**arguments: Any) -> None:
         from offbench.filming import video

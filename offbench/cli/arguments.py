@@ -40,6 +40,13 @@ class Parser(argparse.ArgumentParser):
         self.error(f"unrecognized arguments: {flag}{hint}")
 
 
+def trust(parser: Parser) -> None:
+    """Add --trust, which `main` takes."""
+    parser.add_argument(
+        "--trust", action="store_true", help="import and run the environment that a file names, whatever its code"
+    )
+
+
 def whole(text: str) -> int:
     """Return a whole number from 1 (1e6 and 1_000_000 are understood)."""
     return _whole(text, 1)

@@ -6,7 +6,7 @@ import sys
 from json import dumps
 from typing import Any
 
-from offbench.cli.arguments import Parser, natural, number, whole
+from offbench.cli.arguments import Parser, natural, number, trust, whole
 
 
 def normalize_arguments(parser: Parser, _: list[str]) -> None:
@@ -77,6 +77,7 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--tolerance", type=number, default=0.05, help="of the similar score, share of |Q|")
     parser.add_argument("--action-tolerance", type=number, default=0.1, help="of its second reading")
     parser.add_argument("--workers", type=whole, help="processes (default: one a core)")
+    trust(parser)
 
     def similar(path: str, tolerance: float, action_tolerance: float, seed: int) -> None:
         from offbench.assess import similarity

@@ -8,9 +8,9 @@ import shlex
 import sys
 from typing import Any
 
-from offbench.cli.arguments import Parser, auto, seed_list, share, whole
+from offbench.cli.arguments import Parser, auto, seed_list, share, trust, whole
 
-SWITCHES = ("--tf32", "--tensorboard")  # flags of `train` without a value: the algorithm may follow them
+SWITCHES = ("--tf32", "--tensorboard", "--trust")  # flags of `train` without a value: the algorithm may follow them
 
 
 def train_arguments(parser: Parser, words: list[str]) -> None:
@@ -84,6 +84,7 @@ def _machine(parser: Parser) -> None:
     parser.add_argument("--stack", type=auto, default="auto", help="most runs that train as one program (auto or N)")
     parser.add_argument("--tf32", action="store_true", help="on a GPU: faster, less precise matrix products")
     parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+    trust(parser)
 
 
 def benchmark_arguments(parser: Parser, words: list[str]) -> None:

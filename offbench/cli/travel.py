@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from offbench.cli.arguments import Parser, natural, whole
+from offbench.cli.arguments import Parser, natural, trust, whole
 
 
 def verify_arguments(parser: Parser, _: list[str]) -> None:
@@ -14,6 +14,7 @@ def verify_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--episodes", type=natural, help="to play again (default: 300; 0: none)")
     parser.add_argument("--workers", type=whole, help="processes (default: one a core)")
     parser.add_argument("--json", action="store_true", dest="as_json", help="print the report as JSON")
+    trust(parser)
 
     def run(as_json: bool, **arguments: Any) -> None:
         from offbench.verification import verify

@@ -1,0 +1,128 @@
+"""Environments that a file names are judged by name; code beside the file is imported with --trust alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+
+from offbench.assess import evaluate, open_policy
+from offbench.cli import main
+from offbench.environments import env_spec
+from offbench.errors import OffbenchError
+from offbench.policy import uniform
+from offbench.trust import VARIABLE, check_code
+from tests.faults.test_integrity import trained
+from tests.test_bad_input import refusal
+
+POLE = json.loads(env_spec("InvertedPendulum-v5"))
+OWN = "from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv as Own\nopen('IMPORTED', 'w').close()\n"
+
+
+def wrapped(entry_point: str, **kwargs: Any) -> dict[str, Any]:
+    """Return POLE in a wrapper."""
+    return {"additional_wrappers": [{"name": "Wrapper", "entry_point": entry_point, "kwargs": kwargs}]}
+
+
+def nested(depth: int) -> Any:
+    return [nested(depth - 1)] if depth else 0
+
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"id": "Foo-v0", "entry_point": "own:Own"}, "own:Own"),
+    ({"entry_point": "own:Own"}, "own:Own"),  # under the id of a registered one
+    ({"id": "Foo-v0", "entry_point": "os:system"}, "os:system"),
+    ({"id": "Foo-v0", "entry_point": "gymnasium.envs_of_mine:Own"}, "envs_of_mine"),
+    (wrapped("own:Own"), "own:Own"),
+    (wrapped("stable_baselines3.common.monitor:Monitor", filename="precious"), "monitor:Monitor"),
+    (wrapped("gymnasium.wrappers:RecordVideo", video_folder="x"), "RecordVideo"),
+    (wrapped("gymnasium.wrappers.rendering:HumanRendering"), "HumanRendering"),
+    (wrapped("gymnasium.wrappers:RescaleAction", min_action=10**400, max_action=1), "10000"),
+    ({"kwargs": {"frame_skip": 2_000_000_000}}, "2000000000"),
+    ({"kwargs": {"xml_file": "/dev/zero"}}, "/dev/zero"),
+    ({"kwargs": {"xml_file": "./fifo"}}, "./fifo"),
+    ({"kwargs": {"xml_file": "~root"}}, "~root"),
+    ({"kwargs": {"xml_file": "..\\x"}}, "..\\\\x"),
+    ({"kwargs": {"a": nested(20)}}, "nested"),
+    ({"kwargs": {"a": [0] * 20_000}}, "too many"),
+    ({"kwargs": {"/etc/passwd": 0}}, "/etc/passwd"),
+]
+NEVER: list[tuple[dict[str, Any], str]] = [  # with --trust neither
+    ({"id": "Foo-v0", "entry_point": "gymnasium.envs.registration:load_env_creator"}, "is no Env class"),
+    ({"id": "Foo-v0", "entry_point": "os:system"}, "is no Env class"),
+    ({"id": "Foo-v0", "entry_point": "own"}, "'own' is no module:Class"),
+    (wrapped("gymnasium.envs.mujoco.hopper_v5:HopperEnv"), "is no Wrapper class"),
+]
+ALLOWED: list[dict[str, Any]] = [
+    {},
+    {"id": "Foo-v0"},
+    {"kwargs": {"frame_skip": 4, "reset_noise_scale": 0.1, "xml_file": "inverted_pendulum.xml"}},
+    {"kwargs": {"healthy_z_range": [0.7, float("inf")], "camera": {"distance": 3.0}, "render_mode": None}},
+    wrapped("gymnasium.wrappers:RescaleAction", min_action=-1.0, max_action=1.0),
+    wrapped("gymnasium.wrappers.common:RecordEpisodeStatistics", buffer_length=100),
+]
+
+
+@pytest.fixture
+def own(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A module `own` beside the run that names it; its import leaves a file."""
+    (home / "own.py").write_text(OWN)
+    monkeypatch.syspath_prepend(str(home))
+    monkeypatch.delitem(sys.modules, "own", raising=False)
+    return home
+
+
+def run_of(change: dict[str, Any], folder: Path) -> Path:
+    """Write a run whose environment is the pole with a change."""
+    run = trained(folder / "seed-0")
+    config = json.loads(run.config_path.read_text()) | {"env_spec": json.dumps(POLE | change)}
+    run.config_path.write_text(json.dumps(config))
+    uniform(np.array([-3.0], np.float32), np.array([3.0], np.float32), 4, "").save(run.policy_path)
+    return run.folder
+
+
+@pytest.mark.parametrize(("change", "value"), REFUSED)
+def test_code_and_arguments_that_a_file_may_not_name(change: dict[str, Any], value: str, own: Path) -> None:
+    with pytest.raises(OffbenchError) as refused:
+        open_policy(run_of(change, own))
+    assert value in str(refused.value)
+    assert "--trust" in str(refused.value)
+    assert "own" not in sys.modules
+    assert not (own / "IMPORTED").exists()
+
+
+@pytest.mark.parametrize(("change", "value"), NEVER)
+def test_what_is_no_class_of_an_environment_is_never_run(
+    change: dict[str, Any], value: str, own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(VARIABLE, "1")
+    with pytest.raises(OffbenchError, match=value):
+        open_policy(run_of(change, own))
+
+
+@pytest.mark.parametrize("change", ALLOWED)
+def test_environments_of_gymnasium_with_plain_arguments(change: dict[str, Any]) -> None:
+    check_code(EnvSpec.from_json(json.dumps(POLE | change)))
+
+
+def test_ones_own_environment_runs_with_trust(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In worker processes too; once the command has ended nothing is trusted any more."""
+    run = run_of({"id": "Own-v0", "entry_point": "own:Own"}, own)
+    words = ["evaluate", str(run), "--episodes", "2", "--workers", "2"]
+    main([*words, "--trust"])
+    assert "return" in capsys.readouterr().out
+    assert (own / "IMPORTED").exists()
+    assert VARIABLE not in os.environ
+    assert "own:Own" in refusal(words, capsys)
+
+
+def test_the_variable_is_for_python(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = run_of({"id": "Own-v0", "entry_point": "own:Own"}, own)
+    monkeypatch.setenv(VARIABLE, "1")
+    assert len(evaluate(str(run), episodes=1, workers=1).returns) == 1
