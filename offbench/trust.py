@@ -93,7 +93,7 @@ def _check_class(entry_point: Any, base: type) -> None:
     names = ENTRY_POINT.fullmatch(str(entry_point))
     if names is None:
         raise OffbenchError(f"its entry point {str(entry_point)[:LONGEST]!r} is no module:Class")
-    if not (is_trusting() or _is_allowed(*names.groups(), base)):
+    if not (is_trusting() or _is_allowed(names[1], names[2], base)):
         kind = "environments" if base is gym.Env else "wrappers"
         raise OffbenchError(
             f"it would run {entry_point}, which is not among the {kind} that a file may name; {REMEDY}"

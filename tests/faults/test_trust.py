@@ -22,7 +22,8 @@ from tests.faults.test_integrity import trained
 from tests.test_bad_input import refusal
 
 POLE = json.loads(env_spec("InvertedPendulum-v5"))
-OWN = "from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv as Own\nopen('IMPORTED', 'w').close()\n"
+OWN = "from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv as Own\n"
+OWN += "open('IMPORTED', 'w').close()\n"
 
 
 def wrapped(entry_point: str, **kwargs: Any) -> dict[str, Any]:
