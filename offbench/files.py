@@ -207,6 +207,6 @@ def sha256(data: bytes) -> str:
 
 
 def sha256_of(path: Path) -> str:
-    """Return the hexadecimal SHA-256 of a file, read in pieces."""
-    with open(path, "rb") as file:
+    """Return the hexadecimal SHA-256 of a regular file, read in pieces."""
+    with open(path, "rb", opener=regular) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

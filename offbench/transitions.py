@@ -17,7 +17,7 @@ import os
 import shutil
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,11 +30,13 @@ from filelock import FileLock, Timeout
 from offbench import dataset
 from offbench.environments import box
 from offbench.errors import OffbenchError
-from offbench.files import disk_errors, write_json
+from offbench.files import disk_errors, read_text, sha256_of, write_json
 from offbench.policy import Array
 from offbench.progress import Progress
 
 ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
+ATTEMPTS = 3  # to read a dataset that is replaced meanwhile
+Stamps = dict[str, list[int]]
 CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding are worth a warning
 
 
@@ -105,6 +107,52 @@ def load(dataset_id: str) -> Transitions:
         OffbenchError: no such dataset, spaces other than flat Boxes, NaN or infinite numbers, wrong shapes,
             damaged files, data that are not those of the recorded hash.
     """
+    for _ in range(ATTEMPTS - 1):
+        with contextlib.suppress(ReplacedError), unchanged(dataset_id) as stamps:
+            return _load(dataset_id, stamps)
+    with unchanged(dataset_id) as stamps:
+        return _load(dataset_id, stamps)
+
+
+class ReplacedError(OffbenchError):
+    """A dataset was replaced while it was read: what was read may be part the old one, part the new one."""
+
+
+@contextlib.contextmanager
+def unchanged(dataset_id: str) -> Iterator[Stamps]:
+    """Read a dataset within this context; yields the stamps of its files.
+
+    Raises:
+        ReplacedError: it was replaced meanwhile.
+    """
+    before = _stamps(dataset_id)
+    words = f"{dataset_id} was replaced while it was read; wait until it is recorded, and run the command again"
+    try:
+        yield before
+    except (OffbenchError, OSError) as error:
+        if _stamps(dataset_id) == before:
+            raise
+        raise ReplacedError(words) from error
+    if _stamps(dataset_id) != before:
+        raise ReplacedError(words)
+
+
+def _stamps(dataset_id: str) -> Stamps:
+    """Return the stamp of each file of a dataset by its name; {} if there is none."""
+    folder = dataset.path_of(dataset_id) / "data"
+    try:
+        return {str(p.relative_to(folder)): _stamp(p) for p in sorted(folder.rglob("*")) if p.is_file()}
+    except OSError:  # it is being replaced
+        return {}
+
+
+def _stamp(path: Path) -> list[int]:
+    """Return what changes with a file's content. Its times can be set, but not when it was last touched (ctime)."""
+    found = path.stat()
+    return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
+
+
+def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     metadata = dataset.read_metadata(dataset_id)
     data = _open(dataset_id)
     observation_space = box(data.observation_space, f"{dataset_id}: observations")
@@ -112,15 +160,18 @@ def load(dataset_id: str) -> Transitions:
     if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
         raise OffbenchError(f"{dataset_id}: the action space must be bounded to be scaled, not {action_space}")
     folder = cache() / _key(dataset_id, metadata)
-    found = _mapped(folder)
+    sources = {f"data/{name}": dataset.path_of(dataset_id) / "data" / name for name in stamps}
+    found = _mapped(folder, sources)
     if found is None:
         with disk_errors(str(folder)):
             folder.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(folder.with_name(f"{folder.name}.lock")):
-                found = _mapped(folder)  # another process may have converted it meanwhile
+                found = _mapped(folder, sources)  # another process may have converted it meanwhile
                 if found is None:
-                    _convert(data, dataset_id, observation_space, action_space, folder)
-                    found = _mapped(folder)
+                    with unchanged(dataset_id):
+                        aside = _convert(data, dataset_id, observation_space, action_space, folder, sources)
+                    aside.replace(folder)
+                    found = _mapped(folder, sources)
     if found is None:
         raise OffbenchError(f"cannot read back {folder}; delete it and try again")
     content, arrays = found
@@ -132,13 +183,47 @@ def load(dataset_id: str) -> Transitions:
     return Transitions(dataset_id, content, **arrays, low=action_space.low, high=action_space.high, metadata=metadata)
 
 
-def _mapped(folder: Path) -> tuple[str, dict[str, Array]] | None:
-    """Return the content hash and the arrays of a converted dataset; None if it is not there, or cannot be read."""
+def _mapped(folder: Path, sources: Mapping[str, Path]) -> tuple[str, dict[str, Array]] | None:
+    """Return the content hash and the arrays of a converted dataset.
+
+    None if it is not there, is damaged, or was converted from other files than `sources` are now.
+    """
     try:
+        meta = json.loads(read_text(folder / "meta.json"))
+        paths = {**sources, **{f"{name}.npy": folder / f"{name}.npy" for name in ARRAYS}}
+        files = _checked(paths, meta["files"])
         arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ARRAYS}
-        return str(json.loads((folder / "meta.json").read_text())["content_sha256"]), arrays
     except Exception:  # damaged headers raise what NumPy's parsers happen to; the dataset itself is still there
         return None
+    if files != meta["files"]:
+        with contextlib.suppress(OffbenchError):  # on a read-only disk they are hashed each time
+            write_json(folder / "meta.json", meta | {"files": files})
+    return str(meta["content_sha256"]), arrays
+
+
+def _recorded(path: Path) -> tuple[str, list[int]]:
+    """Return a file's hash and the stamp it had before."""
+    stamp = _stamp(path)
+    return sha256_of(path), stamp
+
+
+def _checked(paths: Mapping[str, Path], recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the hashes and stamps of files that are as recorded, with today's stamps.
+
+    A file with the recorded stamp has not been touched. Any other one, such as a copy, is hashed.
+
+    Raises:
+        ValueError: a file is missing, one too many, or not as recorded.
+    """
+    if paths.keys() != recorded.keys():
+        raise ValueError("other files")
+    found = dict(recorded)
+    for name, path in paths.items():
+        if _stamp(path) != recorded[name][1]:
+            found[name] = list(_recorded(path))
+            if found[name][0] != recorded[name][0]:
+                raise ValueError(f"{path} is not what was written")
+    return found
 
 
 def cache() -> Path:
@@ -156,7 +241,7 @@ def _key(dataset_id: str, metadata: dict[str, Any]) -> str:
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     seen = [(str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
     content = dataset.provenance(metadata).get("content_sha256")
-    text = json.dumps([3, dataset_id, content, str(folder), seen])
+    text = json.dumps([4, dataset_id, content, str(folder), seen])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
@@ -219,8 +304,15 @@ def _open(dataset_id: str) -> Any:
             raise OffbenchError(f"{dataset_id} cannot be read: {error}; record or download it again") from error
 
 
-def _convert(data: Any, dataset_id: str, observations: gym.spaces.Box, actions: gym.spaces.Box, folder: Path) -> None:
-    """Read every episode once and write the arrays; meta.json comes last, then the folder gets its name."""
+def _convert(
+    data: Any,
+    dataset_id: str,
+    observations: gym.spaces.Box,
+    actions: gym.spaces.Box,
+    folder: Path,
+    sources: Mapping[str, Path],
+) -> Path:
+    """Read every episode once and write the arrays beside `folder`, meta.json last; return where they are."""
     _check_storage(dataset_id)
     columns: dict[str, list[Array]] = {name: [] for name in ("observations", "actions", "rewards", "masks")}
     content, lengths, returns = dataset.ContentHash(), [], []
@@ -249,13 +341,20 @@ def _convert(data: Any, dataset_id: str, observations: gym.spaces.Box, actions: 
     _remove_leftovers(folder)
     aside.mkdir()
     try:
+        files = {name: _recorded(path) for name, path in sources.items()}
         for name in ARRAYS:
-            np.save(aside / f"{name}.npy", arrays[name], allow_pickle=False)
-        write_json(aside / "meta.json", {"source": source, "content_sha256": content.hexdigest()})
+            with open(aside / f"{name}.npy", "wb") as file:
+                np.save(file, arrays[name], allow_pickle=False)
+                file.flush()
+                os.fsync(file.fileno())
+            files[f"{name}.npy"] = _recorded(aside / f"{name}.npy")
+        meta = {"source": source, "content_sha256": content.hexdigest(), "files": files}
+        write_json(aside / "meta.json", meta)
         shutil.rmtree(folder, ignore_errors=True)
-        aside.replace(folder)
-    finally:
+    except BaseException:
         shutil.rmtree(aside, ignore_errors=True)
+        raise
+    return aside
 
 
 def _forget(source: str) -> None:

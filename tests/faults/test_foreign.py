@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import json
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
 import offbench
-from offbench import transitions
+from offbench import files, transitions
 from offbench.policy import uniform
 
 REWARDS = "episode_0/rewards"
@@ -87,6 +91,83 @@ def test_a_damaged_cache_is_converted_again(medium: str, home: Path, name: str, 
     assert found.content == right.content
     for array, values in wanted.items():
         np.testing.assert_array_equal(getattr(found, array), values)
+
+
+def other_actions(home: Path) -> None:
+    """Change the cache's numbers, not its sizes."""
+    (path,) = (home / "cache").glob("*/actions.npy")
+    actions = np.load(path)
+    actions[:] = 1
+    np.save(path, actions)
+
+
+@pytest.mark.parametrize("reset_times", [False, True])
+def test_a_changed_number_in_the_cache_is_not_believed(medium: str, home: Path, reset_times: bool) -> None:
+    right = np.array(transitions.load(medium).actions)
+    (path,) = (home / "cache").glob("*/actions.npy")
+    before = path.stat()
+    other_actions(home)
+    if reset_times:
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    np.testing.assert_array_equal(transitions.load(medium).actions, right)
+
+
+def test_a_copied_cache_is_hashed_once_and_believed(medium: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container's image: the same bytes, other times and inodes."""
+    transitions.load(medium)
+    (home / "cache").rename(home / "old")
+    shutil.copytree(home / "old", home / "cache")
+    hashed: list[Path] = []
+    monkeypatch.setattr(transitions, "sha256_of", lambda path: hashed.append(path) or files.sha256_of(path))
+    monkeypatch.setattr(transitions, "_convert", None)
+    transitions.load(medium)
+    assert len(hashed) == len(transitions.ARRAYS)
+    transitions.load(medium)
+    assert len(hashed) == len(transitions.ARRAYS)
+
+
+def test_other_content_of_equal_size_and_time_is_converted(medium: str, home: Path) -> None:
+    """The recorded hash is taken out, as in datasets of others: the files alone tell."""
+    folder = home / "minari" / medium / "data"
+    metadata = json.loads((folder / "metadata.json").read_text())
+    del metadata["offbench"]
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    rewards = np.array(transitions.load(medium).rewards)
+    path = folder / "main_data.hdf5"
+    before = path.stat()
+    with h5py.File(path, "a") as file:
+        file[REWARDS][0] += 1
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert path.stat().st_size == before.st_size
+    assert transitions.load(medium).rewards[0] == rewards[0] + 1
+
+
+@pytest.mark.parametrize("times", [1, 9])
+def test_a_dataset_replaced_while_it_is_loaded(
+    times: int, medium: str, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between its metadata and its arrays: the new one is read, or, if that goes on and on, none."""
+    key, left = transitions._key, itertools.count()
+
+    def replaced(*arguments: Any) -> str:
+        if next(left) < times:
+            shutil.rmtree(home / "minari" / medium)
+            offbench.collect("inverted-pendulum", "random", steps=300 + next(left), dataset_id=medium, workers=1)
+        return key(*arguments)
+
+    monkeypatch.setattr(transitions, "_key", replaced)
+    if times > 1:
+        with pytest.raises(offbench.OffbenchError, match="was replaced while it was read"):
+            transitions.load(medium)
+        return
+    found = transitions.load(medium)
+    monkeypatch.undo()
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(home / "minari"))
+    monkeypatch.setenv("OFFBENCH_CACHE", str(home / "fresh"))
+    now = transitions.load(medium)
+    assert found.content == now.content == now.metadata["offbench"]["content_sha256"]
+    for name in transitions.ARRAYS:
+        np.testing.assert_array_equal(getattr(found, name), getattr(now, name))
 
 
 def test_reading_a_converted_dataset_takes_no_lock(medium: str, home: Path) -> None:
