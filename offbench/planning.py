@@ -14,6 +14,7 @@ from offbench import dataset
 from offbench.calibrate import Rate, measure, operations, step_seconds
 from offbench.consistency import check_recorded
 from offbench.devices import pick_device
+from offbench.environments import believed_env, make_env
 from offbench.errors import OffbenchError
 from offbench.grid import Entry, Grid, Source, Times, load_grid
 from offbench.jobs import Order
@@ -213,6 +214,7 @@ def _known_spec(source: Source) -> str:
     spec = metadata.get("eval_env_spec") or metadata.get("env_spec")
     if not isinstance(spec, str):
         raise OffbenchError(f"{source.id} names no environment to plan by; give its env in the grid")
+    believed_env(spec, source.id).close()
     return spec
 
 
@@ -226,8 +228,6 @@ def _size(source: Source) -> int:
 
 def _bytes_per_step(spec: str) -> int:
     """Return what a transition takes on disk: in the dataset (float64 observations) and in the cache (float32)."""
-    from offbench.environments import make_env
-
     env = make_env(spec)
     observations, actions = env.observation_space.shape, env.action_space.shape
     env.close()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
+from offbench import collect
 from offbench.assess import evaluate, open_policy
 from offbench.cli import main
 from offbench.environments import env_spec
@@ -121,6 +122,16 @@ def test_ones_own_environment_runs_with_trust(own: Path, capsys: pytest.CaptureF
     assert (own / "IMPORTED").exists()
     assert VARIABLE not in os.environ
     assert "own:Own" in refusal(words, capsys)
+
+
+def test_a_plan_runs_nothing_that_a_dataset_names(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dataset = collect("inverted-pendulum", "random", steps=300, workers=1)
+    path = own / "minari" / dataset / "data" / "metadata.json"
+    spec = json.dumps(POLE | {"id": "Foo-v0", "entry_point": "own:Own"})
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"env_spec": spec, "eval_env_spec": spec}))
+    (own / "grid.toml").write_text(f'[[datasets]]\nid = "{dataset}"\n[[algorithms]]\nname = "bc"\n')
+    assert "own:Own" in refusal(["benchmark", "grid.toml", "--plan"], capsys)
+    assert not (own / "IMPORTED").exists()
 
 
 def test_the_variable_is_for_python(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:

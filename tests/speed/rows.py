@@ -98,6 +98,15 @@ def rows(dataset: str) -> list[Row]:
             3,
         ),
         Row(
+            "loading a million transitions from the cache vs without checking hashes",
+            side("load_cached", dataset_id=dataset),
+            side("load_unchecked", dataset_id=dataset),
+            0.95,
+            0.98,
+            1.0,
+            11,
+        ),
+        Row(
             f"evaluation with {n} workers vs SB3's evaluate_policy",
             side("evaluate", workers=n),
             side("sb3_evaluate"),
