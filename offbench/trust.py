@@ -20,7 +20,8 @@ from offbench.errors import OffbenchError
 
 VARIABLE = "OFFBENCH_TRUST"
 REMEDY = f"if you trust where it is from, add --trust ({VARIABLE}=1 in Python)"
-PACKAGES = ("gymnasium.envs.", "gymnasium_robotics.envs.")  # whose environments may be made, registered or not
+# whose environments may be made, registered or not; imported D4RL files name gym's
+PACKAGES = ("gymnasium.envs.", "gymnasium_robotics.envs.", "gym.envs.")
 # of gymnasium.wrappers: those for flat spaces that write no file, open no window and take no function
 WRAPPERS = {
     "ClipAction",
