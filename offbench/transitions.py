@@ -138,11 +138,11 @@ def unchanged(dataset_id: str) -> Iterator[Stamps]:
 
 
 def _stamps(dataset_id: str) -> Stamps:
-    """Return the stamp of each file of a dataset by its name; {} if there is none."""
-    folder = dataset.path_of(dataset_id) / "data"
+    """Return the stamp of each file of a dataset by its name; {} if there is none, or it is being replaced."""
     try:
+        folder = dataset.path_of(dataset_id) / "data"
         return {str(p.relative_to(folder)): _stamp(p) for p in sorted(folder.rglob("*")) if p.is_file()}
-    except OSError:  # it is being replaced
+    except (OffbenchError, OSError):
         return {}
 
 
