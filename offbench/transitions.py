@@ -30,13 +30,13 @@ from filelock import FileLock, Timeout
 from offbench import dataset
 from offbench.environments import box
 from offbench.errors import OffbenchError
-from offbench.files import disk_errors, read_text, sha256_of, write_json
+from offbench.files import disk_errors, read_text, write_json
 from offbench.policy import Array
 from offbench.progress import Progress
+from offbench.stamps import ReplacedError, Stamps, checked, recorded, unchanged
 
 ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
 ATTEMPTS = 3  # to read a dataset that is replaced meanwhile
-Stamps = dict[str, list[int]]
 CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding are worth a warning
 
 
@@ -114,44 +114,6 @@ def load(dataset_id: str) -> Transitions:
         return _load(dataset_id, stamps)
 
 
-class ReplacedError(OffbenchError):
-    """A dataset was replaced while it was read: what was read may be part the old one, part the new one."""
-
-
-@contextlib.contextmanager
-def unchanged(dataset_id: str) -> Iterator[Stamps]:
-    """Read a dataset within this context; yields the stamps of its files.
-
-    Raises:
-        ReplacedError: it was replaced meanwhile.
-    """
-    before = _stamps(dataset_id)
-    words = f"{dataset_id} was replaced while it was read; wait until it is recorded, and run the command again"
-    try:
-        yield before
-    except (OffbenchError, OSError) as error:
-        if _stamps(dataset_id) == before:
-            raise
-        raise ReplacedError(words) from error
-    if _stamps(dataset_id) != before:
-        raise ReplacedError(words)
-
-
-def _stamps(dataset_id: str) -> Stamps:
-    """Return the stamp of each file of a dataset by its name; {} if there is none, or it is being replaced."""
-    try:
-        folder = dataset.path_of(dataset_id) / "data"
-        return {str(p.relative_to(folder)): _stamp(p) for p in sorted(folder.rglob("*")) if p.is_file()}
-    except (OffbenchError, OSError):
-        return {}
-
-
-def _stamp(path: Path) -> list[int]:
-    """Return what changes with a file's content. Its times can be set, but not when it was last touched (ctime)."""
-    found = path.stat()
-    return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
-
-
 def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     metadata = dataset.read_metadata(dataset_id)
     data = _open(dataset_id)
@@ -191,7 +153,7 @@ def _mapped(folder: Path, sources: Mapping[str, Path]) -> tuple[str, dict[str, A
     try:
         meta = json.loads(read_text(folder / "meta.json"))
         paths = {**sources, **{f"{name}.npy": folder / f"{name}.npy" for name in ARRAYS}}
-        files = _checked(paths, meta["files"])
+        files = checked(paths, meta["files"])
         arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ARRAYS}
     except Exception:  # damaged headers raise what NumPy's parsers happen to; the dataset itself is still there
         return None
@@ -199,31 +161,6 @@ def _mapped(folder: Path, sources: Mapping[str, Path]) -> tuple[str, dict[str, A
         with contextlib.suppress(OffbenchError):  # on a read-only disk they are hashed each time
             write_json(folder / "meta.json", meta | {"files": files})
     return str(meta["content_sha256"]), arrays
-
-
-def _recorded(path: Path) -> tuple[str, list[int]]:
-    """Return a file's hash and the stamp it had before."""
-    stamp = _stamp(path)
-    return sha256_of(path), stamp
-
-
-def _checked(paths: Mapping[str, Path], recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the hashes and stamps of files that are as recorded, with today's stamps.
-
-    A file with the recorded stamp has not been touched. Any other one, such as a copy, is hashed.
-
-    Raises:
-        ValueError: a file is missing, one too many, or not as recorded.
-    """
-    if paths.keys() != recorded.keys():
-        raise ValueError("other files")
-    found = dict(recorded)
-    for name, path in paths.items():
-        if _stamp(path) != recorded[name][1]:
-            found[name] = list(_recorded(path))
-            if found[name][0] != recorded[name][0]:
-                raise ValueError(f"{path} is not what was written")
-    return found
 
 
 def cache() -> Path:
@@ -341,13 +278,13 @@ def _convert(
     _remove_leftovers(folder)
     aside.mkdir()
     try:
-        files = {name: _recorded(path) for name, path in sources.items()}
+        files = {name: recorded(path) for name, path in sources.items()}
         for name in ARRAYS:
             with open(aside / f"{name}.npy", "wb") as file:
                 np.save(file, arrays[name], allow_pickle=False)
                 file.flush()
                 os.fsync(file.fileno())
-            files[f"{name}.npy"] = _recorded(aside / f"{name}.npy")
+            files[f"{name}.npy"] = recorded(aside / f"{name}.npy")
         meta = {"source": source, "content_sha256": content.hexdigest(), "files": files}
         write_json(aside / "meta.json", meta)
         shutil.rmtree(folder, ignore_errors=True)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import offbench
-from offbench import files, transitions
+from offbench import files, stamps, transitions
 from offbench.policy import uniform
 
 REWARDS = "episode_0/rewards"
@@ -118,7 +118,7 @@ def test_a_copied_cache_is_hashed_once_and_believed(medium: str, home: Path, mon
     (home / "cache").rename(home / "old")
     shutil.copytree(home / "old", home / "cache")
     hashed: list[Path] = []
-    monkeypatch.setattr(transitions, "sha256_of", lambda path: hashed.append(path) or files.sha256_of(path))
+    monkeypatch.setattr(stamps, "sha256_of", lambda path: hashed.append(path) or files.sha256_of(path))
     monkeypatch.setattr(transitions, "_convert", None)
     transitions.load(medium)
     assert len(hashed) == len(transitions.ARRAYS)

@@ -230,14 +230,14 @@ def load_cached(dataset_id: str) -> Work:
 
 def load_unchecked(dataset_id: str) -> Work:
     """The same without what notices a changed cache and a dataset that is replaced while it is read."""
-    from offbench import transitions
+    from offbench import stamps, transitions
 
     def unchecked(_: object, recorded: dict[str, object]) -> dict[str, object]:
         return recorded
 
-    transitions._checked = unchecked  # type: ignore[assignment]
-    stamps = transitions._stamps(dataset_id)
-    transitions._stamps = lambda _: stamps
+    known = stamps.dataset_stamps(dataset_id)
+    stamps.dataset_stamps = lambda _: known
+    transitions.checked = unchecked  # type: ignore[assignment]
     return load_cached(dataset_id)
 
 
