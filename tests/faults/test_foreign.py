@@ -23,6 +23,12 @@ from offbench.policy import uniform
 REWARDS = "episode_0/rewards"
 
 
+@pytest.fixture
+def recorded(home: Path) -> str:
+    """The id of a small dataset."""
+    return offbench.collect("inverted-pendulum", "random", steps=300, workers=1)
+
+
 def external_link(file: h5py.File, secret: Path) -> None:
     """Put a link to another file in the place of the rewards."""
     del file[REWARDS]
@@ -53,9 +59,9 @@ def virtual(file: h5py.File, secret: Path) -> None:
 
 @pytest.mark.parametrize("lead_away", [external_link, soft_link, external_storage, virtual])
 def test_data_in_another_file_are_not_read(
-    medium: str, home: Path, lead_away: Callable[[h5py.File, Path], None]
+    recorded: str, home: Path, lead_away: Callable[[h5py.File, Path], None]
 ) -> None:
-    path = home / "minari" / medium / "data" / "main_data.hdf5"
+    path = home / "minari" / recorded / "data" / "main_data.hdf5"
     with h5py.File(path) as file:
         rewards = file[REWARDS][:]
     with h5py.File(home / "secret", "w") as file:
@@ -64,22 +70,22 @@ def test_data_in_another_file_are_not_read(
         lead_away(file, home / "secret")
     for read in (transitions.load, transitions.open_minari, lambda name: offbench.export(name, "out.npz")):
         with pytest.raises(offbench.OffbenchError, match=r"episode_0/rewards is not data of .*main_data\.hdf5"):
-            read(medium)
+            read(recorded)
 
 
-def test_data_other_than_the_recorded_hash_are_refused(medium: str, home: Path) -> None:
-    with h5py.File(home / "minari" / medium / "data" / "main_data.hdf5", "a") as file:
+def test_data_other_than_the_recorded_hash_are_refused(recorded: str, home: Path) -> None:
+    with h5py.File(home / "minari" / recorded / "data" / "main_data.hdf5", "a") as file:
         file[REWARDS][0] += 1
     for _ in range(2):  # the second time they are converted already
         with pytest.raises(offbench.OffbenchError, match="content_sha256"):
-            transitions.load(medium)
+            transitions.load(recorded)
 
 
 @pytest.mark.parametrize(
     ("name", "size"), [("rewards.npy", 500), ("masks.npy", 0), ("ends.npy", 20), ("rows.npy", None), ("meta.json", 5)]
 )
-def test_a_damaged_cache_is_converted_again(medium: str, home: Path, name: str, size: int | None) -> None:
-    right = transitions.load(medium)
+def test_a_damaged_cache_is_converted_again(recorded: str, home: Path, name: str, size: int | None) -> None:
+    right = transitions.load(recorded)
     wanted = {array: np.array(getattr(right, array)) for array in transitions.ARRAYS}
     (meta,) = (home / "cache").glob("*/meta.json")
     path = meta.parent / name
@@ -87,7 +93,7 @@ def test_a_damaged_cache_is_converted_again(medium: str, home: Path, name: str, 
         path.unlink()
     else:
         os.truncate(path, size)
-    found = transitions.load(medium)
+    found = transitions.load(recorded)
     assert found.content == right.content
     for array, values in wanted.items():
         np.testing.assert_array_equal(getattr(found, array), values)
@@ -102,81 +108,83 @@ def other_actions(home: Path) -> None:
 
 
 @pytest.mark.parametrize("reset_times", [False, True])
-def test_a_changed_number_in_the_cache_is_not_believed(medium: str, home: Path, reset_times: bool) -> None:
-    right = np.array(transitions.load(medium).actions)
+def test_a_changed_number_in_the_cache_is_not_believed(recorded: str, home: Path, reset_times: bool) -> None:
+    right = np.array(transitions.load(recorded).actions)
     (path,) = (home / "cache").glob("*/actions.npy")
     before = path.stat()
     other_actions(home)
     if reset_times:
         os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-    np.testing.assert_array_equal(transitions.load(medium).actions, right)
+    np.testing.assert_array_equal(transitions.load(recorded).actions, right)
 
 
-def test_a_copied_cache_is_hashed_once_and_believed(medium: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_copied_cache_is_hashed_once_and_believed(
+    recorded: str, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As in a container's image: the same bytes, other times and inodes."""
-    transitions.load(medium)
+    transitions.load(recorded)
     (home / "cache").rename(home / "old")
     shutil.copytree(home / "old", home / "cache")
     hashed: list[Path] = []
     monkeypatch.setattr(stamps, "sha256_of", lambda path: hashed.append(path) or files.sha256_of(path))
     monkeypatch.setattr(transitions, "_convert", None)
-    transitions.load(medium)
+    transitions.load(recorded)
     assert len(hashed) == len(transitions.ARRAYS)
-    transitions.load(medium)
+    transitions.load(recorded)
     assert len(hashed) == len(transitions.ARRAYS)
 
 
-def test_other_content_of_equal_size_and_time_is_converted(medium: str, home: Path) -> None:
+def test_other_content_of_equal_size_and_time_is_converted(recorded: str, home: Path) -> None:
     """The recorded hash is taken out, as in datasets of others: the files alone tell."""
-    folder = home / "minari" / medium / "data"
+    folder = home / "minari" / recorded / "data"
     metadata = json.loads((folder / "metadata.json").read_text())
     del metadata["offbench"]
     (folder / "metadata.json").write_text(json.dumps(metadata))
-    rewards = np.array(transitions.load(medium).rewards)
+    rewards = np.array(transitions.load(recorded).rewards)
     path = folder / "main_data.hdf5"
     before = path.stat()
     with h5py.File(path, "a") as file:
         file[REWARDS][0] += 1
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert path.stat().st_size == before.st_size
-    assert transitions.load(medium).rewards[0] == rewards[0] + 1
+    assert transitions.load(recorded).rewards[0] == rewards[0] + 1
 
 
 @pytest.mark.parametrize("times", [1, 9])
 def test_a_dataset_replaced_while_it_is_loaded(
-    times: int, medium: str, home: Path, monkeypatch: pytest.MonkeyPatch
+    times: int, recorded: str, home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between its metadata and its arrays: the new one is read, or, if that goes on and on, none."""
     key, left = transitions._key, itertools.count()
 
     def replaced(*arguments: Any) -> str:
         if next(left) < times:
-            shutil.rmtree(home / "minari" / medium)
-            offbench.collect("inverted-pendulum", "random", steps=300 + next(left), dataset_id=medium, workers=1)
+            shutil.rmtree(home / "minari" / recorded)
+            offbench.collect("inverted-pendulum", "random", steps=300 + next(left), dataset_id=recorded, workers=1)
         return key(*arguments)
 
     monkeypatch.setattr(transitions, "_key", replaced)
     if times > 1:
         with pytest.raises(offbench.OffbenchError, match="was replaced while it was read"):
-            transitions.load(medium)
+            transitions.load(recorded)
         return
-    found = transitions.load(medium)
+    found = transitions.load(recorded)
     monkeypatch.undo()
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(home / "minari"))
     monkeypatch.setenv("OFFBENCH_CACHE", str(home / "fresh"))
-    now = transitions.load(medium)
+    now = transitions.load(recorded)
     assert found.content == now.content == now.metadata["offbench"]["content_sha256"]
     for name in transitions.ARRAYS:
         np.testing.assert_array_equal(getattr(found, name), getattr(now, name))
 
 
-def test_reading_a_converted_dataset_takes_no_lock(medium: str, home: Path) -> None:
+def test_reading_a_converted_dataset_takes_no_lock(recorded: str, home: Path) -> None:
     """Root may write anywhere, so the right to write is taken away by a lock that cannot be a file."""
-    transitions.load(medium)
+    transitions.load(recorded)
     (lock,) = (home / "cache").glob("*.lock")
     lock.unlink()
     lock.mkdir()
-    assert len(transitions.load(medium)) > 0
+    assert len(transitions.load(recorded)) > 0
 
 
 def test_a_module_that_a_policy_names_is_not_imported(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
