@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.offbench-installed
 
-.PHONY: demo test nightly lint bench docs clean
+.PHONY: demo test nightly lint bench docs clean mujoco-versions
 
 # One install serves all targets; it is repeated when the requirements change.
 $(STAMP): pyproject.toml constraints.txt
@@ -27,6 +27,15 @@ nightly: $(STAMP)
 	OFFBENCH_KILLS=$(KILLS) OFFBENCH_FUZZ=$(FUZZ) $(BIN)/python -m pytest -n auto --dist worksteal \
 		tests/faults/test_kill.py tests/faults/test_fuzz.py -k "kill_9 or many"
 
+# MuJoCo versions that the tests replay shipped transitions on, each in a folder of its own.
+MUJOCO_VERSIONS := 3.2.3 3.4.0 3.5.0 4.0.0
+mujoco-versions: $(MUJOCO_VERSIONS:%=.mujoco/%)
+
+.mujoco/%: $(STAMP)
+	rm -rf $@ $@.part
+	$(BIN)/python -m pip install -q --no-deps --target $@.part mujoco$(if $(filter 4.%,$*),-core)==$*
+	mv $@.part $@
+
 lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -48,4 +57,4 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 clean:
-	rm -rf $(VENV) .venv-d3rlpy build dist *.egg-info demo site
+	rm -rf $(VENV) .venv-d3rlpy .mujoco build dist *.egg-info demo site

@@ -76,8 +76,18 @@ def make_env(spec: str) -> gym.Env[Any, Any]:
     made = EnvSpec.from_json(spec)
     made.disable_env_checker = True
     env = gym.make(made)
+    keep_contacts(env)
     _ask_once(env.unwrapped)
     return env
+
+
+def keep_contacts(env: gym.Env[Any, Any]) -> None:
+    """Give a MuJoCo environment the contacts of MuJoCo before 3.5, whatever version is installed."""
+    if hasattr(env.unwrapped, "model"):
+        from offbench.physics import model_of, restore_margins  # imports MuJoCo, which is slow to load
+
+        if (model := model_of(env)) is not None:
+            restore_margins(model, env.spec.id if env.spec else type(env.unwrapped).__name__)
 
 
 def _ask_once(env: Any) -> None:

@@ -23,6 +23,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench import seeds
 from offbench.assess import open_policy
+from offbench.environments import keep_contacts
 from offbench.errors import OffbenchError
 from offbench.files import disk_errors, output_file, write_bytes
 from offbench.ladder import BEHAVIOUR, find_ladder
@@ -121,6 +122,7 @@ def _drawable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
             env = gym.make(made, render_mode="rgb_array")
     except Exception as error:  # a third party's environment may raise anything here
         raise OffbenchError(f"{made.id} cannot be filmed (render_mode rgb_array): {error}") from error
+    keep_contacts(env)
     world = env.unwrapped
     if isinstance(world, MujocoEnv):
         if backend is None:

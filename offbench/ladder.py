@@ -137,7 +137,7 @@ def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool =
     if not shipped:
         print(f"offbench: using the behaviour agent trained here: {found.folder}", file=sys.stderr)
         _warn_other_recipe(found, recipe)
-    warn_other_physics(f"the behaviour agent of {recipe.name}", found.info.get("versions", {}))
+    warn_other_physics(f"the behaviour agent of {recipe.name}", found.info.get("versions", {}), recipe.env_spec())
     return found
 
 

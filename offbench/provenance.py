@@ -48,10 +48,10 @@ def _processor() -> str:
     return platform.processor() or "unknown"
 
 
-def warn_other_physics(what: str, recorded: dict[str, str]) -> None:
-    """Print a warning when `what` was made on another MuJoCo release series than is installed."""
+def warn_other_physics(what: str, recorded: dict[str, str], spec: str) -> None:
+    """Print a warning when `what` was made on a MuJoCo that moves the environment of an EnvSpec (JSON) differently."""
     made, here = recorded.get("mujoco", ""), versions()["mujoco"]
-    if made and not _same_physics(made, here):
+    if made and not _same_physics(made, here, spec):
         print(
             f"offbench: warning: {what} was made with mujoco {made}, installed is {here}: "
             "the physics differ, scores may not compare",
@@ -59,14 +59,17 @@ def warn_other_physics(what: str, recorded: dict[str, str]) -> None:
         )
 
 
-def _same_physics(a: str, b: str) -> bool:
-    """Return whether two MuJoCo versions lie on the same side of 3.5.0, where Hopper's motion changed."""
-
-    def new(version: str) -> bool:
-        major, minor = (int(part) for part in version.split(".")[:2])
-        return (major, minor) >= (3, 5)
+def _same_physics(a: str, b: str, spec: str) -> bool:
+    """Return whether an environment moves alike on two MuJoCo versions; see offbench.physics."""
+    from offbench.environments import make_env
+    from offbench.physics import RK4_ROTATIONS_SINCE, model_of, release, rotations_changed
 
     try:
-        return new(a) == new(b)
+        if (release(a) >= RK4_ROTATIONS_SINCE) == (release(b) >= RK4_ROTATIONS_SINCE):
+            return True
     except ValueError:
         return a == b
+    env = make_env(spec)
+    model = model_of(env)
+    env.close()
+    return model is None or not rotations_changed(model)

@@ -60,12 +60,12 @@ def cut(orders: Sequence[Order], device: str, processes: int, stack: int | str =
     for data in loaded.values():
         if data.env_spec:
             checked_spec(data.env_spec, data.dataset_id, data.observations.shape[1], data.actions.shape[1])
+            warn_other_physics(data.dataset_id, data.metadata.get("offbench", {}).get("versions", {}), data.env_spec)
         else:
             print(
                 f"offbench: {data.dataset_id} names no environment, so nothing is evaluated while training",
                 file=sys.stderr,
             )
-        warn_other_physics(data.dataset_id, data.metadata.get("offbench", {}).get("versions", {}))
     hosts = {order.algorithm for order in orders} if device != "cpu" else set()
     paired = []
     for order in orders:
