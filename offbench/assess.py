@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from offbench.environments import checked_spec, env_spec, same_environment
+from offbench.environments import ADDED, SINCE, checked_spec, env_spec, same_environment, without_margin
 from offbench.errors import OffbenchError
 from offbench.files import write_json
 from offbench.ladder import shipped_references
@@ -33,6 +33,7 @@ class Evaluation:
 
     Attributes:
         returns, lengths: of each episode.
+        physics: "", or whose contact margins they were played with, in words.
         scores: mean normalised score by reference ("dataset", "d4rl"), those that are known.
     """
 
@@ -41,12 +42,13 @@ class Evaluation:
     returns: list[float]
     lengths: list[int]
     scores: dict[str, float]
+    physics: str = ""
 
     def lines(self) -> list[str]:
         """Return the evaluation as text."""
         mean, low, high = interval(self.returns)
         lines = [
-            f"{self.policy} in {self.env_id}: {counted(len(self.returns), 'episode')}",
+            f"{self.policy} in {self.env_id}{self.physics}: {counted(len(self.returns), 'episode')}",
             f"return {mean:.1f} (95% interval {low:.1f} to {high:.1f}), std {np.std(self.returns):.1f}, "
             f"length {np.mean(self.lengths):.0f}",
         ]
@@ -91,7 +93,8 @@ def evaluate(
     known = config.get("references") if same_environment(config.get("env_spec"), spec) else None
     known = known or {"dataset": shipped_references(spec), "d4rl": d4rl_constants(played)}
     scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in known.items() if pair}
-    return Evaluation(str(path), played, returns, [o.length for o in outcomes], scores)
+    physics = f" with contact margins as in MuJoCo {SINCE[ADDED]}" if without_margin(spec)[1] == ADDED else ""
+    return Evaluation(str(path), played, returns, [o.length for o in outcomes], scores, physics)
 
 
 def similarity(

@@ -16,6 +16,7 @@ from offbench.grid import Source
 from offbench.ladder import Ladder
 from offbench.levels import full_size, parse_level
 from offbench.recipes import Recipe, load_recipe
+from offbench.recorded_env import evaluation_spec
 
 
 def check_recorded(source: Source) -> None:
@@ -38,7 +39,7 @@ def check_recorded(source: Source) -> None:
 
 
 def _differences(metadata: dict[str, Any], source: Source, recipe: Recipe) -> Iterator[str]:
-    spec = metadata.get("eval_env_spec") or metadata.get("env_spec")
+    spec = evaluation_spec(metadata)
     if spec and not same_environment(spec, recipe.env_spec()):
         found = json.loads(spec)["id"]
         yield f"environment {found}" + (f", not {recipe.env_id}" if found != recipe.env_id else " with other settings")

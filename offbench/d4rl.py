@@ -27,7 +27,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench import dataset
 from offbench.d4rlfile import NUMBERS, Source, read_source
-from offbench.environments import box, make_env
+from offbench.environments import ADDED, MARGIN, box, make_env, without_margin
 from offbench.errors import OffbenchError
 from offbench.files import sha256_of
 from offbench.policy import Array
@@ -188,7 +188,9 @@ def _metadata(
         dataset.KEY: ours,
     }
     if evaluated:
-        metadata["eval_env_spec"] = evaluated
+        metadata["eval_env_spec"], rule = without_margin(evaluated)
+        if recipe and rule == ADDED:
+            ours[MARGIN] = rule
     return metadata, spec, _spaces(source, recipe)
 
 

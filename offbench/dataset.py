@@ -17,6 +17,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 from gymnasium.envs.registration import EnvSpec
 
+from offbench.environments import ADDED, EARLIER, MARGIN, without_margin
 from offbench.errors import OffbenchError, nearest, unknown
 from offbench.files import disk_errors, read_json, sole
 from offbench.levels import parse_level
@@ -153,6 +154,8 @@ def _check_metadata(metadata: Any) -> None:
     for key, kind in kinds.items():
         if not isinstance(ours, dict) or not isinstance(ours.get(key, kind()), kind):
             raise ValueError(f"{KEY}.{key} is of another kind")
+    if ours.get(MARGIN) not in (EARLIER, ADDED, None):
+        raise ValueError(f"{KEY}.{MARGIN} is {str(ours[MARGIN])[:40]!r}")
     if not all(isinstance(part, dict) for part in ours.get("parts", [])):
         raise ValueError(f"{KEY}.parts are of another kind")
     if not all(isinstance(version, str) for version in ours.get("versions", {}).values()):
@@ -260,7 +263,7 @@ def write(
         spaces: of observations and actions, where the environment is not to be asked (it may be no longer there).
         expected: the content hash to come, where it is known; any other content is refused.
     """
-    env_spec = EnvSpec.from_json(spec)
+    env_spec = EnvSpec.from_json(without_margin(spec)[0])
     aside = _partial(path)
     with disk_errors(str(path)):
         (aside / "data").mkdir(parents=True)

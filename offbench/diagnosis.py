@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from offbench import dataset
-from offbench.environments import keep_contacts
+from offbench.environments import make_env
 from offbench.errors import OffbenchError
 from offbench.files import read_json
 from offbench.policy import Array
@@ -131,12 +131,8 @@ def replay_error(count: int) -> float:
     Raises:
         OffbenchError: the shipped data are missing or damaged.
     """
-    import gymnasium as gym
-
-    world = gym.make("Hopper-v5")
-    keep_contacts(world)
-    env = world.unwrapped
-    folder = load_recipe("hopper").folder
+    recipe = load_recipe("hopper")
+    env, folder = make_env(recipe.env_spec()).unwrapped, recipe.folder
     assert folder is not None
     ladder = folder / "behaviour"
     digest = read_json(ladder / "ladder.json")["medium_replay"]["sha256"]

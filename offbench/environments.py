@@ -1,11 +1,18 @@
 """Environments: made from a recipe's id, or from the EnvSpec that a dataset or a run carries.
 
 An EnvSpec names the code that makes the environment, so one that came in a file is checked before it is believed.
+
+The EnvSpecs that offbench passes around, and keeps in runs, may have a field that Gymnasium's have not,
+`contact_margin`: "sum" is the rule of MuJoCo 3.5 and later, "max", the default, that of earlier versions
+(offbench.physics). Minari's metadata get the plain EnvSpec.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sys
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +22,29 @@ from gymnasium.envs.registration import EnvSpec
 from offbench.errors import OffbenchError
 from offbench.trust import check_code
 
-WHAT_MATTERS = ("id", "kwargs", "max_episode_steps")  # what makes two specs the same environment
+WHAT_MATTERS = ("id", "kwargs", "max_episode_steps")  # with the contact margins, what makes two specs the same
+MARGIN = "contact_margin"
+EARLIER, ADDED = "max", "sum"  # the larger margin of two geoms, or both together
+SINCE = {EARLIER: "before 3.5", ADDED: "3.5 and later"}  # the MuJoCo versions whose rule it is
+
+
+def with_margin(spec: str, rule: str) -> str:
+    """Return an EnvSpec (JSON) with the rule for contact margins that its environment is to have."""
+    plain = without_margin(spec)[0]
+    return plain if rule == EARLIER else json.dumps(json.loads(plain) | {MARGIN: rule})
+
+
+def without_margin(spec: str) -> tuple[str, str]:
+    """Return Gymnasium's own EnvSpec (JSON), and the rule for contact margins.
+
+    Raises:
+        OffbenchError: there is no such rule.
+    """
+    fields = json.loads(spec)
+    rule = fields.pop(MARGIN, EARLIER)
+    if rule not in (EARLIER, ADDED):
+        raise OffbenchError(f"{MARGIN} must be {EARLIER} or {ADDED}, not {rule!r}")
+    return (json.dumps(fields) if MARGIN in spec else spec), rule
 
 
 def env_spec(env_id: str, **kwargs: Any) -> str:
@@ -25,7 +54,8 @@ def env_spec(env_id: str, **kwargs: Any) -> str:
         OffbenchError: it cannot be made, or its spaces are of another kind.
     """
     try:
-        env = gym.make(env_id, **kwargs)
+        with _quiet_loading(env_id):
+            env = gym.make(env_id, **kwargs)
         assert env.spec is not None
         text = env.spec.to_json()
     except Exception as error:  # a third-party environment may raise anything here
@@ -61,7 +91,7 @@ def believed_env(text: str, where: str) -> gym.Env[Any, Any]:
         OffbenchError: it names code that is no Gymnasium environment, or cannot be made.
     """
     try:
-        check_code(EnvSpec.from_json(text))
+        check_code(EnvSpec.from_json(without_margin(text)[0]))
         return make_env(text)
     except OffbenchError as error:
         raise OffbenchError(f"{where}: {error}") from None
@@ -71,23 +101,46 @@ def believed_env(text: str, where: str) -> gym.Env[Any, Any]:
         ) from error
 
 
-def make_env(spec: str) -> gym.Env[Any, Any]:
-    """Make the environment of an EnvSpec in JSON, without the step-by-step checker."""
-    made = EnvSpec.from_json(spec)
+def make_env(spec: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
+    """Make the environment of an EnvSpec in JSON, without the step-by-step checker, with the contacts it asks for."""
+    plain, rule = without_margin(spec)
+    made = EnvSpec.from_json(plain)
     made.disable_env_checker = True
-    env = gym.make(made)
-    keep_contacts(env)
+    with _quiet_loading(made.id):
+        options: dict[str, Any] = {"render_mode": render_mode} if render_mode else {}  # else the EnvSpec's own
+        env = gym.make(made, **options)
+    if hasattr(env.unwrapped, "model"):
+        from offbench.physics import model_of, set_contacts  # imports MuJoCo, which is slow to load
+
+        if (model := model_of(env)) is not None:
+            set_contacts(model, rule, made.id)
     _ask_once(env.unwrapped)
     return env
 
 
-def keep_contacts(env: gym.Env[Any, Any]) -> None:
-    """Give a MuJoCo environment the contacts of MuJoCo before 3.5, whatever version is installed."""
-    if hasattr(env.unwrapped, "model"):
-        from offbench.physics import model_of, restore_margins  # imports MuJoCo, which is slow to load
+@contextlib.contextmanager
+def _quiet_loading(env_id: str) -> Iterator[None]:
+    """Say nothing of what MuJoCo finds deprecated in Gymnasium's own models, such as HalfCheetah's `settotalmass`.
 
-        if (model := model_of(env)) is not None:
-            restore_margins(model, env.spec.id if env.spec else type(env.unwrapped).__name__)
+    MuJoCo would print it and write MUJOCO_LOG.TXT into the working directory, for each environment that is made.
+    """
+    registered = gym.registry.get(env_id)
+    if registered is None or not str(registered.entry_point).startswith("gymnasium.envs.mujoco."):
+        yield
+        return
+    import mujoco
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_say_unless_deprecated)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _say_unless_deprecated(warning: str) -> None:
+    if "deprecated" not in warning:
+        print(f"offbench: warning: MuJoCo: {warning.strip()}", file=sys.stderr)
 
 
 def _ask_once(env: Any) -> None:
@@ -124,7 +177,8 @@ def same_environment(a: str | None, b: str | None) -> bool:
     if a is None or b is None:
         return a is b
     first, second = json.loads(a), json.loads(b)
-    return all(first.get(key) == second.get(key) for key in WHAT_MATTERS)
+    same = all(first.get(key) == second.get(key) for key in WHAT_MATTERS)
+    return same and first.get(MARGIN, EARLIER) == second.get(MARGIN, EARLIER)
 
 
 def _reason(error: Exception) -> str:

@@ -8,6 +8,7 @@ A film runs in real time: k follows from the environment's own frame rate (125 s
 from __future__ import annotations
 
 import io
+import json
 import os
 import warnings
 from collections.abc import Generator, Iterator
@@ -19,11 +20,10 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
-from gymnasium.envs.registration import EnvSpec
 
 from offbench import seeds
 from offbench.assess import open_policy
-from offbench.environments import keep_contacts
+from offbench.environments import make_env
 from offbench.errors import OffbenchError
 from offbench.files import disk_errors, output_file, write_bytes
 from offbench.ladder import BEHAVIOUR, find_ladder
@@ -97,7 +97,7 @@ def _who(path: str, env: str | None) -> tuple[Policy, str, bool]:
     source = SINGLE.get(level) or parse_level(level)[1][0].source
     spec = recipe.env_spec()
     if source == "uniform":
-        world = gym.make(EnvSpec.from_json(spec))
+        world = make_env(spec)
         space, shape = world.action_space, world.observation_space.shape
         world.close()
         return uniform(space.low, space.high, shape[0], recipe.env_id), spec, True  # type: ignore[attr-defined, index]
@@ -114,15 +114,12 @@ def _who(path: str, env: str | None) -> tuple[Policy, str, bool]:
 
 def _drawable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
     """Make the environment for drawing. Raises OffbenchError if it cannot be drawn here."""
-    made = EnvSpec.from_json(spec)
-    made.disable_env_checker = True
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that it does not list this mode: its first picture tells
-            env = gym.make(made, render_mode="rgb_array")
+            env = make_env(spec, "rgb_array")
     except Exception as error:  # a third party's environment may raise anything here
-        raise OffbenchError(f"{made.id} cannot be filmed (render_mode rgb_array): {error}") from error
-    keep_contacts(env)
+        raise OffbenchError(f"{json.loads(spec)['id']} cannot be filmed (render_mode rgb_array): {error}") from error
     world = env.unwrapped
     if isinstance(world, MujocoEnv):
         if backend is None:

@@ -22,6 +22,7 @@ from offbench.launch import configurations
 from offbench.levels import full_size, parse_level
 from offbench.progress import duration
 from offbench.recipes import Recipe, load_recipe
+from offbench.recorded_env import evaluation_spec
 from offbench.registry import load_algorithm
 from offbench.runs import Run, run_folder, settings_dict, variant
 from offbench.stacking import finished
@@ -210,9 +211,8 @@ def _recipe(source: Source) -> Recipe:
 
 
 def _known_spec(source: Source) -> str:
-    metadata = dataset.read_metadata(source.id)
-    spec = metadata.get("eval_env_spec") or metadata.get("env_spec")
-    if not isinstance(spec, str):
+    spec = evaluation_spec(dataset.read_metadata(source.id))
+    if spec is None:
         raise OffbenchError(f"{source.id} names no environment to plan by; give its env in the grid")
     believed_env(spec, source.id).close()
     return spec

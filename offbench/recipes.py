@@ -16,7 +16,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from offbench.environments import env_spec
+from offbench.environments import ADDED, EARLIER, env_spec, with_margin
 from offbench.errors import OffbenchError, unknown
 from offbench.files import damage, read_text
 from offbench.settings import build, setting
@@ -64,6 +64,9 @@ class Recipe:
     dataset_steps: int = setting(1_000_000, "transitions of a recorded level", low=1)
     d4rl_min: float | None = setting(None, "D4RL's reference score of a random policy")
     d4rl_max: float | None = setting(None, "D4RL's reference score of an expert")
+    contact_margin: str = setting(
+        EARLIER, "contact margins of MuJoCo before 3.5 (max) or since (sum)", choices=(EARLIER, ADDED)
+    )
     env_kwargs: tuple[tuple[str, Any], ...] = ()
     sac: SACSettings = dataclasses.field(default_factory=SACSettings)
     measure: Measurement = dataclasses.field(default_factory=Measurement)
@@ -71,11 +74,13 @@ class Recipe:
 
     def env_spec(self) -> str:
         """Return the environment as Gymnasium's EnvSpec JSON. Raises OffbenchError if it cannot be made."""
-        return env_spec(self.env_id, **dict(self.env_kwargs))
+        return with_margin(env_spec(self.env_id, **dict(self.env_kwargs)), self.contact_margin)
 
     def sha256(self) -> str:
         """Return a hash over everything the recipe says (not over its layout or comments)."""
         values = {k: v for k, v in dataclasses.asdict(self).items() if k != "folder"}
+        if self.contact_margin == EARLIER:
+            del values["contact_margin"]  # the only rule before it was a setting: hashes of that time stay
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 

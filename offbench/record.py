@@ -10,17 +10,19 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from offbench import dataset
 from offbench.cards import compare
 from offbench.consistency import warn_other_references
-from offbench.environments import make_env
+from offbench.environments import MARGIN, make_env, without_margin
 from offbench.errors import OffbenchError
 from offbench.files import sha256
 from offbench.grid import Source
 from offbench.ladder import BEHAVIOUR, MEDIUM, MEDIUM_AT_MOST, Ladder, Rung, find_ladder
 from offbench.levels import Part, full_size, parse_level, parse_mix, shares
+from offbench.physics import model_of
 from offbench.policy import Policy, uniform
 from offbench.progress import Progress, duration
 from offbench.provenance import versions
@@ -95,7 +97,7 @@ def collect(
         with Progress(total, f"recording {dataset_id}") as progress:
             streams = (recording.episodes(*item) for item in zip(parts, sources, counts, itertools.count()))
             episodes = _counted(itertools.chain.from_iterable(streams), progress)
-            content = dataset.write(path, episodes, recording.spec, metadata, total)
+            content = dataset.write(path, episodes, recording.spec, metadata, total, recording.spaces)
     if seed == 0 and steps is None and not retrain and (said := compare(recipe, name, content)):
         print(f"offbench: {said}", file=sys.stderr)
     warn_other_references(recipe, ladder)
@@ -173,7 +175,13 @@ class _Recording:
         env = make_env(self.spec)
         self.observation_space: Any = env.observation_space
         self.action_space: Any = env.action_space
+        self.mujoco = model_of(env) is not None
         env.close()
+
+    @property
+    def spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
+        """Of observations and actions."""
+        return self.observation_space, self.action_space
 
     def source(self, part: Part) -> Rung | None:
         """Return the rung a part is played by, or None for uniform actions and the replay."""
@@ -283,7 +291,7 @@ def _metadata(
     return {
         "dataset_id": dataset_id,
         "minari_version": made["minari"],
-        "eval_env_spec": recording.spec,
+        "eval_env_spec": without_margin(recording.spec)[0],
         "algorithm_name": "random" if all(p.source == "uniform" for p in parts) else "SAC (Stable-Baselines3)",
         "author": {"offbench"},
         "author_email": {"offbench@example.org"},
@@ -302,6 +310,7 @@ def _metadata(
             "parts": described,
             "references": references,
             "d4rl": None if recipe.d4rl_min is None else [recipe.d4rl_min, recipe.d4rl_max],
+            MARGIN: recipe.contact_margin if recording.mujoco else None,
             "versions": made,
         },
     }

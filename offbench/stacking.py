@@ -23,6 +23,7 @@ from offbench.errors import OffbenchError
 from offbench.jobs import Job, Order
 from offbench.provenance import made_with, warn_other_physics
 from offbench.recipes import d4rl_constants
+from offbench.recorded_env import say_margin
 from offbench.registry import load_algorithm
 from offbench.runs import FORMAT, Run, settings_dict, variant
 from offbench.settings import fields
@@ -60,6 +61,7 @@ def cut(orders: Sequence[Order], device: str, processes: int, stack: int | str =
     for data in loaded.values():
         if data.env_spec:
             checked_spec(data.env_spec, data.dataset_id, data.observations.shape[1], data.actions.shape[1])
+            say_margin(data.dataset_id, data.metadata, data.env_spec)
             warn_other_physics(data.dataset_id, data.metadata.get("offbench", {}).get("versions", {}), data.env_spec)
         else:
             print(
@@ -108,6 +110,7 @@ def pending(part: Part, schedule: Schedule, *, tf32: bool = False, command: str 
     """
     for order, member in zip(part.orders, part.members, strict=True):
         member.run.claim(_config(order, member, schedule, tf32, command))
+        _check_environment(member)
         if member.data.env_spec:
             _check_evaluations(member.run, schedule.eval_every)
     order_of = {member.run.folder: order for order, member in zip(part.orders, part.members, strict=True)}
@@ -168,6 +171,20 @@ def together(members: Sequence[Member], steps: int) -> list[list[Member]]:
         groups.append(group)
         left = [member for member in left if member not in group]
     return groups
+
+
+def _check_environment(member: Member) -> None:
+    """Refuse a run that was evaluated in another environment so far, such as one with other contact margins."""
+    before = member.run.config().get("env_spec")
+    try:
+        same = before is None or member.data.env_spec is None or same_environment(before, member.data.env_spec)
+    except (ValueError, TypeError, AttributeError):  # damaged
+        same = False
+    if not same:
+        raise OffbenchError(
+            f"{member.run.folder} was evaluated in another environment than {member.data.dataset_id} names now "
+            f"({before}, not {member.data.env_spec}); delete it or give another --runs"
+        )
 
 
 def _check_evaluations(run: Run, every: int) -> None:

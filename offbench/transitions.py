@@ -33,6 +33,7 @@ from offbench.errors import OffbenchError
 from offbench.files import disk_errors, read_text, write_json
 from offbench.policy import Array
 from offbench.progress import Progress
+from offbench.recorded_env import evaluation_spec
 from offbench.stamps import ReplacedError, Stamps, checked, recorded, unchanged
 
 ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
@@ -63,7 +64,7 @@ class Transitions:
     @property
     def env_spec(self) -> str | None:
         """The environment to evaluate in, as EnvSpec JSON; None if the dataset does not name one."""
-        return self.metadata.get("eval_env_spec") or self.metadata.get("env_spec")
+        return evaluation_spec(self.metadata)
 
     @property
     def env_id(self) -> str:

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from offbench import dataset, seeds
 from offbench.claims import check_claims
-from offbench.environments import believed_env, box
+from offbench.environments import ADDED, EARLIER, SINCE, believed_env, box, with_margin
 from offbench.errors import OffbenchError
 from offbench.findings import Findings, Report
 from offbench.provenance import versions
-from offbench.resimulate import Verdict, check
+from offbench.recorded_env import margins_matter, recorded_margin, recorded_mujoco
+from offbench.resimulate import Recorded, Verdict, check
 from offbench.rollout import Rollouts, result
 from offbench.seeds import Purpose
 from offbench.survey import Survey, episodes_of, survey
@@ -27,6 +27,8 @@ from offbench.wording import counted
 from offbench.workers import default_workers
 
 EPISODES = 300  # played again by default: half a minute for a million transitions
+SOME = 10  # of them tell the rule for contact margins, about
+REQUIREMENT = {EARLIER: "mujoco<3.5", ADDED: "mujoco>=3.5"}
 FEW = 20_000  # steps to play again that are not worth worker processes
 
 
@@ -109,19 +111,31 @@ def _play(
         return
     if not chosen or not _same_spaces(spec, data, report, findings):
         return
-    made, here = _recorded_mujoco(metadata), versions()["mujoco"]
+    made, here = recorded_mujoco(metadata), versions()["mujoco"]
     exact = made == here
     if made is not None and not exact:
         report.warnings.append(f"recorded with mujoco {made}, installed is {here}: compared within a tolerance")
     last_unknown = dataset.provenance(metadata).get("final_observations") == "repeated"
     steps = sum(found.lengths[i] for i in chosen)
+    names = [int(data.episode_indices[i]) for i in chosen]
     with Rollouts(spec, workers if workers > 1 and steps > FEW else 0) as rollouts:
-        names = [int(data.episode_indices[i]) for i in chosen]
-        jobs = [
-            rollouts.call(check, spec, e, exact, last_unknown and bool(e.terminations[-1]))
-            for e in episodes_of(data, names)
-        ]
-        verdicts: list[Verdict] = [result(job) for job in jobs]
+
+        def replay(spec: str, episodes: Iterable[Recorded]) -> list[Verdict]:
+            jobs = [rollouts.call(check, spec, e, exact, last_unknown and bool(e.terminations[-1])) for e in episodes]
+            return [result(job) for job in jobs]
+
+        rule = recorded_margin(metadata)
+        if rule is None and margins_matter(spec):
+            some = list(episodes_of(data, names[:: max(1, len(names) // SOME)]))
+            off = {rule: sum(bool(v.faults) for v in replay(with_margin(spec, rule), some)) for rule in SINCE}
+            rule = min(off, key=off.__getitem__)
+            if off[EARLIER] != off[ADDED]:
+                report.warnings.append(
+                    f"recorded with the contact margins of MuJoCo {SINCE[rule]}, as {counted(len(some), 'episode')} "
+                    f"show, and its metadata do not tell: add {REQUIREMENT[rule]!r} to its requirements, so that "
+                    "policies are evaluated with them"
+                )
+        verdicts = replay(with_margin(spec, rule or EARLIER), episodes_of(data, names))
     _tell(verdicts, made if exact else None, report, findings)
 
 
@@ -139,19 +153,6 @@ def _same_spaces(spec: str, data: Any, report: Report, findings: Findings) -> bo
     if not same:
         findings.add("other-spaces", "metadata", f"{env.observation_space} and {theirs}")
     return same
-
-
-def _recorded_mujoco(metadata: dict[str, Any]) -> str | None:
-    """Return the MuJoCo version a dataset was recorded with: ours, or what a requirement pins; None if unknown."""
-    made = dataset.provenance(metadata).get("versions")
-    if isinstance(made, dict) and "mujoco" in made:
-        return str(made["mujoco"])
-    listed = metadata.get("requirements")
-    for requirement in listed if isinstance(listed, list) else []:
-        pinned = re.fullmatch(r"mujoco\s*==\s*([\w.]+)", str(requirement))
-        if pinned:
-            return pinned[1]
-    return None
 
 
 def _choose(found: Survey, limit: int | None, last: Sequence[int], episodes: int) -> list[int]:
