@@ -1,6 +1,6 @@
 """`card`: an environment's dataset card, from its ladder and its five recorded levels.
 
-    card.json   each level's statistics and content hash, and the versions they hold for
+    card.json   each level's statistics, the versions they hold for, and a content hash for each MuJoCo version
     README.md   the same to read, with references, rungs and provenance
     card.png    the learning curve and the histogram of returns of each level
 
@@ -65,7 +65,8 @@ def card(env: str, out: str | Path | None = None, behaviour_dir: str | Path = BE
         print(f"offbench: warning: the levels of {recipe.name} are out of order: {means}", file=sys.stderr)
     folder = Path(out or f"{recipe.name}-card")
     made = {name: versions()[name] for name in DECIDE}
-    write_json(folder / "card.json", {"format": "offbench-card-1", "versions": made, "levels": facts})
+    _keep_hashes(recipe, facts, made["mujoco"])
+    write_json(folder / "card.json", {"format": "offbench-card-2", "versions": made, "levels": facts})
     _draw(recipe, ladder, levels, folder / "card.png")
     write_bytes(folder / "README.md", ("\n".join(_text(recipe, ladder, facts, made)) + "\n").encode())
     return folder
@@ -82,11 +83,29 @@ def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
     known = read_json(path)
     if level not in known["levels"]:
         return None
-    if known["levels"][level]["content_sha256"] == content_sha256:
+    contents = known["levels"][level]["content_sha256"]
+    if content_sha256 in contents.values():
         return "content equal to the dataset card's, bit for bit"
-    others = [f"{name} {version}" for name, version in known["versions"].items() if versions()[name] != version]
+    here = versions()["mujoco"]
+    made = known["versions"] | {"mujoco": here if here in contents else next(iter(contents))}
+    others = [f"{name} {version}" for name, version in made.items() if versions()[name] != version]
     reason = f"made with {', '.join(others)}" if others else "made with the same versions: another processor or libm?"
     return f"warning: content differs from the dataset card's, {reason}"
+
+
+def _keep_hashes(recipe: Recipe, facts: dict[str, dict[str, Any]], mujoco: str) -> None:
+    """Add to each level the content hashes that the shipped card has of other MuJoCo versions.
+
+    Its replay is what tells whether the shipped card is of the same ladder: no simulator has a part in it.
+    """
+    path = recipe.folder / "card.json" if recipe.folder else None
+    known = read_json(path)["levels"] if path is not None and path.exists() else {}
+    same = known and facts["medium-replay"]["content_sha256"] in known["medium-replay"]["content_sha256"].values()
+    for level, values in facts.items():
+        others = known[level]["content_sha256"] if same else {}
+        values["content_sha256"] = {mujoco: values["content_sha256"]} | {
+            v: c for v, c in others.items() if v != mujoco
+        }
 
 
 def _recorded(recipe: Recipe, ladder: Ladder, level: str, collect: str) -> Summary:
@@ -170,9 +189,15 @@ def _text(recipe: Recipe, ladder: Ladder, facts: Mapping[str, Any], made: Mappin
         ],
     )
     yield from ("", "## Content", "")
-    yield f"SHA-256 over the arrays in episode order, for {', '.join(f'{n} {v}' for n, v in made.items())}:"
+    others = ", ".join(f"{name} {version}" for name, version in made.items() if name != "mujoco")
+    yield f"SHA-256 over the arrays in episode order, for {others} and each MuJoCo version:"
     yield ""
-    yield from markdown(["level", "content"], [[level, f"`{v['content_sha256']}`"] for level, v in facts.items()])
+    rows = [
+        [level, version, f"`{content}`"]
+        for level, v in facts.items()
+        for version, content in v["content_sha256"].items()
+    ]
+    yield from markdown(["level", "mujoco", "content"], rows)
     yield from ("", "`offbench collect` says whether what it recorded is the same.")
 
 

@@ -44,7 +44,8 @@ def test_the_readme_says_what_the_card_says(name: str) -> None:
     text, known = (shipped(name) / "README.md").read_text(), read_json(shipped(name) / "card.json")
     for level, facts in known["levels"].items():
         assert f"| {level} | {facts['transitions']:,} | {facts['episodes']:,} | {facts['return']:,.1f} |" in text
-        assert facts["content_sha256"] in text
+        for version, content in facts["content_sha256"].items():
+            assert f"| {level} | {version} | `{content}` |" in text
     assert (shipped(name) / "card.png").stat().st_size < 300_000
 
 
@@ -56,7 +57,7 @@ def test_a_level_recorded_at_full_size_has_the_cards_content(level: str, capfd: 
     found = dataset.provenance(dataset.read_metadata(f"inverted-pendulum-{level}-v0"))
     same = {name: versions()[name] for name in known["versions"]} == known["versions"]
     assert same, "the tests run with the versions of constraints.txt"
-    assert found["content_sha256"] == known["levels"][level]["content_sha256"]
+    assert found["content_sha256"] == known["levels"][level]["content_sha256"][versions()["mujoco"]]
     assert "content equal to the dataset card's, bit for bit" in capfd.readouterr().err
 
 
@@ -89,11 +90,18 @@ def test_a_card_is_made_from_the_five_levels(home: Path) -> None:
 def test_another_content_is_said_with_the_likely_reason(home: Path) -> None:
     recipe = replace(load_recipe("hopper"), folder=home)
     assert compare(recipe, "medium", "abc") is None  # no card
-    known = {"versions": {"numpy": versions()["numpy"]}, "levels": {"medium": {"content_sha256": "abc"}}}
+    here = versions()["mujoco"]
+    contents = {here: "abc", "3.4.9": "abe"}
+    known = {"versions": {"numpy": versions()["numpy"]}, "levels": {"medium": {"content_sha256": contents}}}
     (home / "card.json").write_text(json.dumps(known))
     assert compare(recipe, "60percent", "abc") is None  # no such level on it
     assert compare(recipe, "medium", "abc") == "content equal to the dataset card's, bit for bit"
+    assert (
+        compare(recipe, "medium", "abe") == "content equal to the dataset card's, bit for bit"
+    )  # the earlier MuJoCo's
     assert "made with the same versions: another processor" in str(compare(recipe, "medium", "abd"))
+    (home / "card.json").write_text(json.dumps(known | {"levels": {"medium": {"content_sha256": {"3.4.9": "abe"}}}}))
+    assert "differs from the dataset card's, made with mujoco 3.4.9" in str(compare(recipe, "medium", "abd"))
     (home / "card.json").write_text(json.dumps(known | {"versions": {"numpy": "0.1"}}))
     assert "differs from the dataset card's, made with numpy 0.1" in str(compare(recipe, "medium", "abd"))
 

@@ -57,7 +57,10 @@ def test_a_shipped_dataset_card_is_shown(home: Path, monkeypatch: pytest.MonkeyP
     shutil.copytree(package / "assets", home / "package" / "assets")
     shutil.copytree(package / "published", home / "package" / "published")
     values = {"transitions": 1000, "episodes": 7, "return": 12.3, "std": 4.5, "score": 33.3, "terminated": 0.25}
-    card = {"versions": {"mujoco": "3.4.0"}, "levels": {"medium": values | {"content_sha256": "0123456789abcdef"}}}
+    card = {
+        "versions": {"mujoco": "3.4.0"},
+        "levels": {"medium": values | {"content_sha256": {"3.4.0": "0123456789abcdef"}}},
+    }
     write_json(home / "package" / "datasets" / "hopper" / "card.json", card)
     (home / "package" / "datasets" / "hopper" / "card.png").write_bytes(b"\x89PNG")
     made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)

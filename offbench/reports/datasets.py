@@ -102,7 +102,7 @@ def _facts(values: Mapping[str, Any]) -> list[tuple[str, float | None]]:
     return [
         *numbers,
         (f"{100 * values['terminated']:.1f}%", values["terminated"]),
-        (values["content_sha256"][:SHOWN], None),
+        (next(iter(values["content_sha256"].values()))[:SHOWN], None),  # of the recording whose statistics these are
     ]
 
 
