@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from offbench.filming import video
     from offbench.launch import train
     from offbench.record import collect
-    from offbench.recorded_env import make_env_of as make_env
+    from offbench.recorded_env import make_env
     from offbench.reports import report
     from offbench.tables import normalize_runs_or_returns as normalize
     from offbench.transitions import load
@@ -76,7 +76,7 @@ _VERBS = {
     "import_d4rl": ("offbench.d4rl", "import_d4rl"),
     "inventory": ("offbench.describe", "inventory"),
     "load": ("offbench.transitions", "load"),
-    "make_env": ("offbench.recorded_env", "make_env_of"),
+    "make_env": ("offbench.recorded_env", "make_env"),
     "normalize": ("offbench.tables", "normalize_runs_or_returns"),
     "report": ("offbench.reports", "report"),
     "show": ("offbench.describe", "show"),

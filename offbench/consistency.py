@@ -10,13 +10,12 @@ from collections.abc import Iterator
 from typing import Any
 
 from offbench import dataset
-from offbench.environments import same_environment
+from offbench.environments import same_environment, without_margin
 from offbench.errors import OffbenchError
 from offbench.grid import Source
 from offbench.ladder import Ladder
 from offbench.levels import full_size, parse_level
 from offbench.recipes import Recipe, load_recipe
-from offbench.recorded_env import evaluation_spec
 
 
 def check_recorded(source: Source) -> None:
@@ -39,8 +38,8 @@ def check_recorded(source: Source) -> None:
 
 
 def _differences(metadata: dict[str, Any], source: Source, recipe: Recipe) -> Iterator[str]:
-    spec = evaluation_spec(metadata)
-    if spec and not same_environment(spec, recipe.env_spec()):
+    spec = metadata.get("eval_env_spec") or metadata.get("env_spec")
+    if spec and not same_environment(spec, without_margin(recipe.env_spec())[0]):
         found = json.loads(spec)["id"]
         yield f"environment {found}" + (f", not {recipe.env_id}" if found != recipe.env_id else " with other settings")
     ours = dataset.provenance(metadata)

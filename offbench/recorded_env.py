@@ -9,8 +9,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from offbench import dataset
-from offbench.environments import ADDED, EARLIER, MARGIN, SINCE, believed_env, make_env, with_margin
+from offbench import dataset, environments
+from offbench.environments import ADDED, EARLIER, MARGIN, SINCE, believed_env, with_margin
 from offbench.errors import OffbenchError
 from offbench.provenance import versions
 from offbench.recipes import load_recipe, names
@@ -18,7 +18,7 @@ from offbench.recipes import load_recipe, names
 CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d+)(?:\.(\d+))?")  # of a requirement: `>=3.1.0,<3.2.0` has two
 
 
-def make_env_of(name: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
+def make_env(name: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
     """Make a dataset's environment, or a recipe's, with the same physics on every MuJoCo version.
 
     Args:
@@ -29,14 +29,14 @@ def make_env_of(name: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
         OffbenchError: there is no such dataset or recipe, it names no environment, or that cannot be made.
     """
     if name in names() or Path(name).suffix == ".toml":
-        return make_env(load_recipe(name).env_spec(), render_mode)
+        return environments.make_env(load_recipe(name).env_spec(), render_mode)
     metadata = dataset.read_metadata(name)
     spec = evaluation_spec(metadata)
     if spec is None:
         raise OffbenchError(f"{name} names no environment; give the name or the file of a recipe instead")
     believed_env(spec, name).close()
     say_margin(name, metadata, spec)
-    return make_env(spec, render_mode)
+    return environments.make_env(spec, render_mode)
 
 
 def evaluation_spec(metadata: dict[str, Any]) -> str | None:
@@ -85,7 +85,7 @@ def margins_matter(spec: str) -> bool:
     """Return whether the rule for contact margins makes a difference in an environment (EnvSpec JSON)."""
     from offbench.physics import has_margins, model_of  # imports MuJoCo, which is slow to load
 
-    env = make_env(spec)
+    env = environments.make_env(spec)
     model = model_of(env)
     env.close()
     return model is not None and has_margins(model)
