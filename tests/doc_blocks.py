@@ -38,6 +38,7 @@ REASONS = (
     "needs a GPU",
     "takes days",
     "takes hours",
+    "needs other MuJoCo versions",
     "needs d3rlpy's environment and the runs above",
     "needs a renderer",
     "needs D4RL's files",
