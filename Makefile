@@ -41,15 +41,15 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-# Speed against others and against the machine, into docs/benchmarks-KIND.md. d3rlpy has an environment of its own.
-bench: $(STAMP) .venv-d3rlpy/bin/python
+# Speed against others and against the machine, into docs/benchmarks-KIND.md. d3rlpy and JAX have an environment of their own.
+bench: $(STAMP) .venv-peers/pins.txt
 	$(BIN)/python -m pip install -q -c constraints.txt "minari[create]"
 	$(BIN)/python -m tests.speed
 
-.venv-d3rlpy/bin/python:
-	$(PYTHON) -m venv .venv-d3rlpy
-	grep -E "^(torch|numpy)==" constraints.txt > .venv-d3rlpy/pins.txt
-	.venv-d3rlpy/bin/python -m pip install -q -c .venv-d3rlpy/pins.txt d3rlpy==2.8.1
+.venv-peers/pins.txt: tests/speed/peers.txt
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/python -m pip install -q -r tests/speed/peers.txt
+	cp tests/speed/peers.txt $@
 
 # The site of docs/, into site/; a broken link or a page left out of the contents stops it.
 docs: $(STAMP)
@@ -57,4 +57,4 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 clean:
-	rm -rf $(VENV) .venv-d3rlpy .mujoco build dist *.egg-info demo site
+	rm -rf $(VENV) .venv-peers .mujoco build dist *.egg-info demo site

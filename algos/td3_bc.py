@@ -70,7 +70,6 @@ class TD3BC:
     """A stack of TD3+BC runs."""
 
     Config = Config
-    joins = ("bdb", {"beta": 0.0})  # on a GPU these runs may train in a stack of BDB: there, they are beta = 0
 
     def __init__(
         self,

@@ -33,7 +33,6 @@ class Member:
 
     Attributes:
         algorithm: its name in the registry.
-        guest: it is a special case of the algorithm whose stack this is (TD3+BC in one of BDB).
     """
 
     run: Run
@@ -41,7 +40,6 @@ class Member:
     config: Any
     data: Transitions
     algorithm: str
-    guest: bool = False
 
 
 class Store:

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from offbench.batches import Member
 from offbench.devices import arithmetic, stack_size
 from offbench.environments import make_env
-from offbench.perceptron import HAS_ONEDNN
+from offbench.perceptron import only_pytorch
 from offbench.registry import load_algorithm
 from offbench.runs import Run
 from offbench.stack import WARM_UP, Stack
@@ -23,14 +22,6 @@ SECONDS = 0.5  # that a measurement lasts at least
 ROWS = 4096  # made-up transitions
 ENV_STEPS = 2000
 COUNTED = 4  # updates whose operations are counted: of every kind that takes turns
-
-
-def _of_linear(x: Any, weight: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
-    return int(2 * np.prod(x) * weight[0])
-
-
-# The products that offbench.perceptron gives to oneDNN: PyTorch's counter does not know them.
-ONEDNN_COUNT = {torch.ops.mkldnn._linear_pointwise: _of_linear} if HAS_ONEDNN else {}
 
 
 @dataclass(frozen=True)
@@ -77,9 +68,10 @@ def operations(algorithm: str, config: Any, spec: str) -> float:
     from torch.utils.flop_counter import FlopCounterMode
 
     learning = Stack(load_algorithm(algorithm), [made_up(algorithm, config, spec)], "cpu")
+    learning.program.eager = True
     for _ in learning.train(2 * WARM_UP):  # past whatever happens only once
         pass
-    with FlopCounterMode(display=False, custom_mapping=ONEDNN_COUNT) as counter:
+    with only_pytorch(), FlopCounterMode(display=False) as counter:
         for _ in learning.train(2 * WARM_UP + COUNTED):
             pass
     return float(counter.get_total_flops()) / COUNTED

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import gc
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
+import numpy as np
+import threadpoolctl
 import torch
 
 from offbench.algorithm import Algorithm
@@ -16,8 +16,6 @@ from offbench.errors import OffbenchError
 from offbench.stack import WARM_UP, Stack
 
 CPU_STACK = 8  # runs of one process: more gain nothing there, and each waits for all
-# glibc's mallopt: blocks up to 32 MiB (its most) come from the heap, of which up to 512 MiB that are free are kept.
-KEEP = ((-3, 2**25), (-1, 2**29))  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD
 MEMORY_SHARE = 0.8  # of a GPU's free memory that a stack may take
 
 
@@ -44,29 +42,19 @@ def pick_device(device: str) -> str:
 def arithmetic(device: str, tf32: bool) -> Iterator[None]:
     """Set threads and precision of matrix products for a training, and put them back after it.
 
-    On the CPU one thread: two runs in two processes beat one run on two threads; and freed memory is kept from here
-    on. On a GPU float32, or TF32 (10 bits of mantissa, several times faster) where the user asks for it.
+    On the CPU one thread, NumPy's products included: two runs in two processes beat one run on two threads. On a GPU
+    float32, or TF32 (10 bits of mantissa, several times faster) where the user asks for it.
     """
     threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
-    if device == "cpu":
-        torch.set_num_threads(1)
-        _keep_memory()
     torch.set_float32_matmul_precision("high" if tf32 else "highest")
-    try:
+    with ExitStack() as undo:
+        undo.callback(torch.set_float32_matmul_precision, precision)
+        if device == "cpu":
+            torch.set_num_threads(1)
+            undo.callback(torch.set_num_threads, threads)
+            undo.enter_context(threadpoolctl.threadpool_limits(1, user_api="blas"))
+            undo.enter_context(np.errstate(all="ignore"))  # a run that diverges is reported once, by Stack.diverged
         yield
-    finally:
-        torch.set_num_threads(threads)
-        torch.set_float32_matmul_precision(precision)
-
-
-def _keep_memory() -> None:
-    """Let the C library keep freed memory for the next update, where it is glibc.
-
-    By itself it hands the large arrays of an update back to the kernel, which clears their pages anew for each one.
-    """
-    with contextlib.suppress(AttributeError, OSError, TypeError):  # of what other systems have instead
-        for parameter, value in KEEP:
-            ctypes.CDLL(None).mallopt(parameter, value)
 
 
 def stack_size(kind: type[Algorithm], member: Member, device: str) -> int:

@@ -46,25 +46,11 @@ class Order:
     seed: int
     folder: str
 
-    @property
-    def host(self) -> str | None:
-        """The algorithm that this one is a special case of, and whose stack it may join."""
-        joins = getattr(load_algorithm(self.algorithm), "joins", None)
-        return joins[0] if joins else None
-
-    def config(self, kind: str | None = None) -> Any:
-        """Return the settings, as those of `kind` if that is the algorithm's host. Raises OffbenchError."""
-        own: Any = build(load_algorithm(self.algorithm).Config, self.settings, self.algorithm)
-        if kind in (None, self.algorithm):
-            return own
-        _, special = load_algorithm(self.algorithm).joins  # type: ignore[attr-defined]
-        return load_algorithm(str(kind)).Config(**vars(own), **special)
-
-    def member(self, data: Transitions | None = None, kind: str | None = None) -> Member:
-        """Return the run as a stack of `kind` takes it. Raises OffbenchError for a bad setting or dataset."""
+    def member(self, data: Transitions | None = None) -> Member:
+        """Return the run as a stack takes it. Raises OffbenchError for a bad setting or dataset."""
+        config: Any = build(load_algorithm(self.algorithm).Config, self.settings, self.algorithm)
         data = data or transitions.load(self.dataset)
-        run, guest = Run(Path(self.folder)), kind not in (None, self.algorithm)
-        return Member(run, self.seed, self.config(kind), data, self.algorithm, guest)
+        return Member(Run(Path(self.folder)), self.seed, config, data, self.algorithm)
 
 
 @dataclass(frozen=True)
@@ -110,7 +96,7 @@ def perform(job: Job, report: Report) -> list[str]:
     from offbench.devices import arithmetic
 
     loaded = {name: transitions.load(name) for name in dict.fromkeys(order.dataset for order in job.orders)}
-    members = [order.member(loaded[order.dataset], job.kind) for order in job.orders]
+    members = [order.member(loaded[order.dataset]) for order in job.orders]
     with arithmetic(job.schedule.device, job.tf32):
         return Trainer(load_algorithm(job.kind), members, job.schedule, job.tf32).train(report)
 

@@ -117,12 +117,7 @@ class Network(Learned):
 
     def forward(self, flat: Tensor, *inputs: Tensor) -> Tensor:
         """Return the outputs [copies, runs, batch, out] of the networks in `flat`."""
-        x = torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
-        copies, (runs, batch, width) = flat.shape[0], x.shape
-        if copies > 1:
-            x = x.expand(copies, runs, batch, width).reshape(copies * runs, batch, width)
-        out = perceptrons(flat.reshape(copies * runs, -1), x, self.sizes, self.activation)
-        return out.view(copies, runs, batch, -1)
+        return perceptrons(flat, inputs, self.sizes, self.activation)
 
     def layers(self, run: int) -> list[tuple[Tensor, Tensor]]:
         """Return (weight [in, out], bias [out]) of each layer of one run's first copy, on the CPU."""

@@ -1,159 +1,268 @@
-"""The forward and backward pass of many equal perceptrons, written out.
+"""The forward and backward pass of many equal perceptrons.
 
-Autograd would do the same, slower. On a CPU each product goes to the faster of PyTorch's two libraries: oneDNN, which
-also applies the activation on its way, or what `@` calls (`make bench` compares them). Only gradients that somebody
-asks for are computed. On a GPU all perceptrons are one batched product a layer.
+    flat [copies, runs, P] = W0 [in, h] | b0 [h] | W1 [h, h] | b1 [h] | ... | 0
+    inputs [runs, batch, dim], concatenated to x [runs, batch, in]   ->   outputs [copies, runs, batch, out]
 
-    x [nets, batch, in],  flat [nets, P] = W0 [in, h] | b0 [h] | W1 [h, h] | b1 [h] | ... | 0  ->  [nets, batch, out]
+On a GPU a layer of all perceptrons is one batched product, and autograd does the way back (`stacked`).
+
+On a CPU one perceptron goes after the other, so that its arrays stay in the cache, and its passes are written out
+(`Pass`): buffers are kept between calls, products are NumPy's (OpenBLAS writes into them), and only gradients that
+somebody asks for are computed. A layer's weights and bias lie one after the other, so they are one matrix, and
+the inputs of each layer have a last column of ones:
+
+    [h | 1] [batch, in + 1]  @  [W; b] [in + 1, out]          one product gives h W + b,
+    [h | 1].T @ gradient                                      and one the gradients of W and b
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-# Which library is faster was measured over a range of shapes, on a processor of each kind. Processor and shape decide,
-# never the clock: a run must be the same each time. Where PyTorch has AVX-512, oneDNN does the larger products in half
-# the time on AMD's processors, on which the other library keeps to AVX2. Elsewhere the other one is ahead, but for
-# products with very few columns.
-WIDE: bool = torch.backends.cpu.get_cpu_capability().startswith("AVX512")
-# Multiplications of a product below which a call of oneDNN costs more than it saves.
-WORTH_IT, WORTH_IT_WHEN_NARROW, WORTH_IT_WHEN_COPIED = 2**17, 2**21, 2**22
-FEW_COLUMNS = 8
-# On a CPU a long batch goes through the layers in blocks that stay in the cache from one operation to the next: of so
-# many numbers a layer, but of no fewer rows than pay for a block's own overhead.
-BLOCK, BLOCK_ROWS = 2**19, 1024
-Layer = tuple[Tensor, Tensor]  # weight [.., in, out], bias [.., out]
-HAS_ONEDNN: bool = torch._C._has_mkldnn and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+from offbench.capture import one_call
+
+_ONLY_PYTORCH = ContextVar("only_pytorch", default=False)
+Array = np.ndarray[Any, np.dtype[np.float32]]
+ALIGNED = 16  # float32 numbers of 64 bytes: rows of buffers begin where a processor's wide registers do
 
 
-def perceptrons(flat: Tensor, x: Tensor, sizes: Sequence[int], activation: str) -> Tensor:
-    """Return the outputs [nets, batch, out] of perceptrons with layers of `sizes`, differentiable once.
+def perceptrons(flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str) -> Tensor:
+    """Return the outputs [copies, runs, batch, out] of perceptrons with layers of `sizes`, differentiable once.
 
     Args:
-        flat: all weights and biases [nets, P]; what lies behind the last bias has no effect.
-        x: inputs [nets, batch, in].
+        flat: all weights and biases [copies, runs, P]; what lies behind the last bias has no effect.
+        inputs: each [runs, batch, dim].
         activation: of the hidden layers, relu or tanh.
     """
-    rows = max(BLOCK // max(sizes), BLOCK_ROWS)
-    if x.shape[1] > rows and not _batched(x):
-        return torch.cat([perceptrons(flat, block, sizes, activation) for block in torch.split(x, rows, 1)], 1)
-    if torch.is_grad_enabled() and (flat.requires_grad or x.requires_grad):
-        found: Tensor = _Perceptrons.apply(flat, x, tuple(sizes), activation)  # type: ignore[no-untyped-call]
-        return found
-    return _forward(flat, x, sizes, activation)[0]
+    if flat.device.type != "cpu" or flat.dtype != torch.float32 or _ONLY_PYTORCH.get():
+        return stacked(flat, inputs, sizes, activation)
+    outputs: Tensor = _Perceptrons.apply(flat, tuple(sizes), activation, *inputs)  # type: ignore[no-untyped-call]
+    return outputs
 
 
-def _forward(
-    flat: Tensor, x: Tensor, sizes: Sequence[int], activation: str
-) -> tuple[Tensor, list[list[Layer]], list[Tensor]]:
-    """Return the outputs, and what the way back needs: each group's layers, and what went into each of them."""
-    outputs, nets, kept = [], [], []
-    for own, h in zip(_each(flat), _each(x), strict=True):
-        nets.append(layers := _layers(own, sizes))
-        kept.append(h)
-        for weight, bias in layers[:-1]:
-            kept.append(h := affine(h, weight, bias, activation))
-        outputs.append(affine(h, *layers[-1], "none"))
-    return _together(outputs), nets, kept
+@contextmanager
+def only_pytorch() -> Iterator[None]:
+    """Leave all products to PyTorch, whose tools do not see NumPy's."""
+    token = _ONLY_PYTORCH.set(True)
+    try:
+        yield
+    finally:
+        _ONLY_PYTORCH.reset(token)
 
 
-class _Perceptrons(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, flat: Tensor, x: Tensor, sizes: tuple[int, ...], activation: str) -> Tensor:
-        out, ctx.nets, kept = _forward(flat, x, sizes, activation)
-        ctx.save_for_backward(flat, *kept)  # flat, whose views the layers are: autograd sees if it was changed
-        ctx.sizes, ctx.activation = sizes, activation
-        ctx.used = sum((i + 1) * o for i, o in itertools.pairwise(sizes))
-        return out
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        flat, *kept = ctx.saved_tensors
-        of_flat, of_x = ctx.needs_input_grad[:2]
-        depth = len(kept) // len(ctx.nets)
-        of_nets, x_grads = torch.empty_like(flat) if of_flat else None, list[Tensor]()
-        if of_nets is not None:
-            of_nets[..., ctx.used :] = 0
-        for group, (layers, grad) in enumerate(zip(ctx.nets, _each(grads[0]), strict=True)):
-            own = _layers(_each(of_nets)[group], ctx.sizes) if of_nets is not None else []
-            for layer in reversed(range(depth)):
-                weight, h = layers[layer][0], kept[group * depth + layer]
-                if own:
-                    product(h.mT, grad, out=own[layer][0])
-                    torch.sum(grad, -2, out=own[layer][1])
-                if layer:
-                    grad = _before(product(grad, weight.mT), h, ctx.activation)
-                elif of_x:
-                    x_grads.append(product(grad, weight.mT))
-        return of_nets, _together(x_grads) if of_x else None, None, None
+def stacked(flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str) -> Tensor:
+    """Return what `perceptrons` does, all of them at once, differentiable as often as one likes."""
+    x = torch.cat(list(inputs), -1)
+    copies, (runs, batch, width) = flat.shape[0], x.shape
+    h = x.expand(copies, runs, batch, width).reshape(copies * runs, batch, width)
+    layers = _layers(flat.reshape(copies * runs, -1), sizes)
+    for layer, both in enumerate(layers):
+        h = torch.baddbmm(both[:, -1:], h, both[:, :-1])
+        if layer < len(layers) - 1:
+            h = h.relu() if activation == "relu" else h.tanh()
+    return h.view(copies, runs, batch, -1)
 
 
-def _batched(tensor: Tensor) -> bool:
-    """On a GPU all nets at once; on a CPU one after the other, for one net's arrays stay in the cache."""
-    return tensor.is_cuda
-
-
-def _each(tensor: Tensor) -> Sequence[Tensor]:
-    """Return what is computed together: all nets' part of a tensor, or each net's without its axis."""
-    return (tensor,) if _batched(tensor) else tensor.unbind()
-
-
-def _together(parts: list[Tensor]) -> Tensor:
-    """Undo `_each`."""
-    return parts[0] if _batched(parts[0]) else torch.stack(parts)
-
-
-def _layers(flat: Tensor, sizes: Sequence[int]) -> list[Layer]:
-    """Return each layer's weight and bias, views of `flat` [.., P]."""
-    outer, strides, first = flat.shape[:-1], flat.stride()[:-1], flat.storage_offset()
-    layers = []
+def _layers(flat: Tensor, sizes: Sequence[int]) -> list[Tensor]:
+    """Return each layer's weights and bias as one matrix [.., in + 1, out], views of `flat` [.., P]."""
+    layers, first = [], 0
     for i, o in itertools.pairwise(sizes):
-        weight = flat.as_strided((*outer, i, o), (*strides, o, 1), first)
-        layers.append((weight, flat.as_strided((*outer, o), (*strides, 1), first + i * o)))
+        layers.append(flat[..., first : first + (i + 1) * o].view(*flat.shape[:-1], i + 1, o))
         first += (i + 1) * o
     return layers
 
 
-def affine(x: Tensor, weight: Tensor, bias: Tensor, activation: str) -> Tensor:
-    """Return activation(x @ weight + bias) [.., batch, out]."""
-    if _onednn(x, weight):
-        return _linear(x, weight.mT, bias, activation)
-    out = torch.addmm(bias, x, weight) if x.dim() == 2 else torch.baddbmm(bias.unsqueeze(1), x, weight)
-    return out if activation == "none" else out.relu_() if activation == "relu" else out.tanh_()
+class _Perceptrons(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, flat: Tensor, sizes: tuple[int, ...], activation: str, *inputs: Tensor) -> Tensor:
+        keep = any(ctx.needs_input_grad)
+        with one_call() as recording:
+            ctx.made = made = Pass(flat, inputs, sizes, activation, keep)
+            made.run()
+        if recording:
+            recording.add(("forward", sizes, activation, keep), (flat, inputs), made.outputs, (made.run, (), {}))
+        ctx.save_for_backward(flat)  # autograd sees if it was changed since
+        return made.outputs
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        (flat,) = ctx.saved_tensors
+        needs = ctx.needs_input_grad[0], ctx.needs_input_grad[3:]
+        with one_call() as recording:
+            back = PassBack(ctx.made, flat, grads[0], *needs)
+            back.run()
+        found = (back.of_flat, *back.of_inputs)
+        if recording:
+            reads, writes = (ctx.made.outputs, grads[0]), [one for one in found if one is not None]
+            recording.add(("backward", needs), reads, writes, (back.run, (), {}))
+        return found[0], None, None, *found[1:]
 
 
-def product(a: Tensor, b: Tensor, out: Tensor | None = None) -> Tensor:
-    """Return a @ b [.., m, n], in `out` if it is given."""
-    if not _onednn(a, b):
-        return torch.matmul(a, b, out=out)
-    found = _linear(a, b.mT, None, "none")
-    return found if out is None else out.copy_(found)
+class Pass:
+    """A forward pass on the CPU, with buffers of its own.
+
+    Args:
+        keep: whether a backward pass may follow, so that the layers' activations must not be overwritten.
+    """
+
+    def __init__(
+        self, flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str, keep: bool
+    ) -> None:
+        self.sizes, self.activation = sizes, activation
+        self.shape = (flat.shape[0], *inputs[0].shape[:2])  # copies, runs, batch
+        copies, runs, batch = self.shape
+        self.widths = [x.shape[-1] for x in inputs]
+        self.outputs = torch.empty(*self.shape, sizes[-1])
+        x = [_with_ones(batch, sizes[0]) for _ in range(runs)]
+        starts = [0, *itertools.accumulate(self.widths)]
+        self._loads = [
+            (x[run][:, start:end], part[run])
+            for start, end, part in zip(starts, starts[1:], (_array(part) for part in inputs), strict=False)
+            for run in range(runs)
+        ]
+        self.layers = [_array(layer) for layer in _layers(flat, sizes)]  # each [copies, runs, in + 1, out]
+        # what goes into each layer, [batch, in + 1], of each perceptron
+        self.into: dict[tuple[int, int], list[Array]] = {}
+        self._steps: list[tuple[Array, Array, Array, Callable[[], Any] | None]] = []
+        outputs = _array(self.outputs)
+        for copy, run in itertools.product(range(copies), range(runs)):
+            h, self.into[copy, run] = x[run], [x[run]]
+            for layer, width in enumerate(sizes[1:-1]):
+                make = _with_ones if keep else _shared(f"layer {layer}", _with_ones)
+                into = make(batch, width)
+                hidden = torch.from_numpy(into[:, :-1])
+                activate = hidden.relu_ if activation == "relu" else hidden.tanh_
+                self._steps.append((h, self.layers[layer][copy, run], into[:, :-1], activate))
+                h = into
+                self.into[copy, run].append(into)
+            self._steps.append((h, self.layers[-1][copy, run], outputs[copy, run], None))
+
+    def run(self) -> None:
+        """Compute `outputs`."""
+        for into, source in self._loads:
+            np.copyto(into, source)
+        for h, layer, out, activate in self._steps:
+            np.matmul(h, layer, out=out)
+            if activate is not None:
+                activate()
 
 
-def _before(grad: Tensor, h: Tensor, activation: str) -> Tensor:
-    """Turn the gradient of an activation's output h into that of its input, in place."""
-    if activation == "relu":
-        return torch.ops.aten.threshold_backward.grad_input(grad, h, 0, grad_input=grad)  # type: ignore[no-any-return]
-    return torch.ops.aten.tanh_backward.grad_input(grad, h, grad_input=grad)  # type: ignore[no-any-return]
+class PassBack:
+    """The backward pass of a forward pass.
+
+    Attributes:
+        of_flat, of_inputs: the gradients; None where nobody needs them.
+    """
+
+    def __init__(
+        self, forward: Pass, flat: Tensor, grad: Tensor, needs_flat: bool, needs_inputs: Sequence[bool]
+    ) -> None:
+        copies, runs, batch = forward.shape
+        sizes, widths = forward.sizes, forward.widths
+        self.of_flat = torch.zeros_like(flat) if needs_flat else None
+        of_layers = [_array(layer) for layer in _layers(self.of_flat, sizes)] if self.of_flat is not None else None
+        self.of_inputs = [
+            torch.empty(runs, batch, width) if needed else None
+            for width, needed in zip(widths, needs_inputs, strict=True)
+        ]
+        self._calls: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
+        last = _array(grad)
+        if not grad.is_contiguous():
+            last = np.empty(grad.shape, np.float32)
+            self._calls.append((np.copyto, (last, _array(grad))))
+        for copy, run in itertools.product(range(copies), range(runs)):
+            g = last[copy, run]
+            for layer in reversed(range(len(sizes) - 1)):
+                h, weight = forward.into[copy, run][layer], forward.layers[layer][copy, run][:-1]
+                if of_layers is not None:
+                    self._calls.append((np.matmul, (h.T, g, of_layers[layer][copy, run])))
+                if layer:
+                    before = _shared(f"gradient {layer % 2}", _rows)(batch, sizes[layer])
+                    self._product(g, weight.T, before)
+                    self._calls.append(_through(forward.activation, before, h[:, :-1]))
+                    g = before
+                    continue
+                start = 0
+                for width, found in zip(widths, self.of_inputs, strict=True):
+                    if found is not None:
+                        part, of_input = weight[start : start + width].T, _array(found)[run]
+                        if copy == 0:
+                            self._product(g, part, of_input)
+                        else:
+                            other = _shared("gradient of an input", _rows)(batch, width)
+                            self._product(g, part, other)
+                            self._calls.append((np.add, (of_input, other, of_input)))
+                    start += width
+
+    def _product(self, a: Array, b: Array, out: Array) -> None:
+        """Add the call of a @ b; NumPy is slow at outer products, those of a layer with one output."""
+        if a.shape[1] == 1:
+            arguments = [torch.from_numpy(array) for array in (a, b, out)]
+            self._calls.append((_multiply, tuple(arguments)))
+        else:
+            self._calls.append((np.matmul, (a, b, out)))
+
+    def run(self) -> None:
+        """Compute `of_flat` and `of_inputs`."""
+        for function, arguments in self._calls:
+            function(*arguments)
 
 
-def _onednn(a: Tensor, b: Tensor) -> bool:
-    if not HAS_ONEDNN or a.dim() > 2 or a.dtype != torch.float32 or a.is_cuda:
-        return False
-    (m, k), n = a.shape, b.shape[1]
-    if n == 1 or (n > FEW_COLUMNS and not WIDE):
-        return False
-    if n > FEW_COLUMNS and not a.is_contiguous():  # the gradients of weights: PyTorch turns `a` round for oneDNN
-        return m * k * n >= WORTH_IT_WHEN_COPIED
-    return m * k * n >= (WORTH_IT if k >= 64 else WORTH_IT_WHEN_NARROW)
+def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
+    torch.mul(a, b, out=out)
 
 
-def _linear(a: Tensor, b: Tensor, bias: Tensor | None, activation: str) -> Tensor:
-    """Return oneDNN's activation(a @ b.T + bias) of one network: the operation that PyTorch's own compiler calls."""
-    found: Tensor = torch.ops.mkldnn._linear_pointwise.default(a, b, bias, activation, [], "")
-    return found
+def _through(activation: str, gradient: Array, h: Array) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    """Return the call that turns the gradient of an activation's output h into that of its input, in place."""
+    return (_through_relu if activation == "relu" else _through_tanh), tuple(map(torch.from_numpy, (gradient, h)))
+
+
+def _through_relu(gradient: Tensor, h: Tensor) -> None:
+    torch.ops.aten.threshold_backward.grad_input(gradient, h, 0, grad_input=gradient)
+
+
+def _through_tanh(gradient: Tensor, h: Tensor) -> None:
+    torch.ops.aten.tanh_backward.grad_input(gradient, h, grad_input=gradient)
+
+
+def _array(tensor: Tensor) -> Array:
+    """Return a NumPy array that shares a tensor's memory."""
+    array: Array = tensor.detach().numpy()
+    return array
+
+
+def _rows(batch: int, width: int) -> Array:
+    """Return an array [batch, width] whose rows are aligned."""
+    padded = -(-width // ALIGNED) * ALIGNED
+    return torch.zeros(batch, padded).numpy()[:, :width]
+
+
+def _with_ones(batch: int, width: int) -> Array:
+    """Return an array [batch, width + 1] whose last column is 1."""
+    array = _rows(batch, width + 1)
+    array[:, -1] = 1
+    return array
+
+
+_SCRATCH = threading.local()
+
+
+def _shared(use: str, make: Callable[[int, int], Array]) -> Callable[[int, int], Array]:
+    """Return `make` whose arrays all passes of this thread share, for what is used up within one pass."""
+
+    def shared(batch: int, width: int) -> Array:
+        arrays: dict[Any, Array] = _SCRATCH.__dict__.setdefault("arrays", {})
+        key = (use, batch, width)
+        if key not in arrays:
+            arrays[key] = make(batch, width)
+        return arrays[key]
+
+    return shared

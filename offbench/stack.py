@@ -1,12 +1,13 @@
 """A stack: runs that learn as one program.
 
-Program   one update of every run, fed from buffers that stay in place: on a GPU it is captured once as a
-          CUDA graph for each kind of update, and the host only replays it
+Program   one update of every run, fed from buffers that stay in place: it is captured once for each kind of update and
+          then replayed, on a GPU as a CUDA graph, on a CPU by offbench.capture
 Stack     the learning state of the runs: train, log, policies, what a checkpoint keeps
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -15,11 +16,13 @@ from torch import Tensor
 
 from offbench.algorithm import Algorithm, PolicyParts, check_logs, stack_configs
 from offbench.batches import CHUNK, Member, Store, draw_chunk
+from offbench.capture import NotCapturableError, Recording, record
 from offbench.errors import OffbenchError
 from offbench.networks import Learned, Target
 from offbench.policy import Policy, check_networks
 
 Sums = list[tuple[str, float, int]]  # of each logged quantity: its name, its sum, and over how many updates
+RECORD_EVERY = 1000  # updates of a kind between two records of it on a CPU
 WARM_UP = 3  # updates of a kind before it is captured: libraries allocate their workspaces in the first ones
 
 
@@ -27,7 +30,7 @@ class Program:
     """One update of every run, over and over.
 
     A counter on the device picks each update's rows of the chunk, and logs are added up on the device, so nothing
-    waits for the host. On the CPU the same program runs as it is.
+    waits for the host.
     """
 
     def __init__(self, algorithm: Algorithm, store: Store) -> None:
@@ -39,7 +42,9 @@ class Program:
         self.counts: dict[str, int] = {}
         self._names: dict[str, list[str]] = {}  # what each kind of update logs
         self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
+        self._recordings: dict[str, Recording] = {}
         self._done: dict[str, int] = {}
+        self.eager = not getattr(algorithm, "capture", True)  # whether every update runs as it is
         self._side: Any = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
 
     def load(self, indices: Tensor, noise: Mapping[str, Tensor], first: int) -> None:
@@ -53,14 +58,50 @@ class Program:
 
     def run(self, kind: str) -> None:
         """Do the next update."""
-        if self._side is None:
+        if self._side is not None:
+            if kind in self._graphs:
+                self._graphs[kind].replay()
+            else:
+                self._first(kind, self._side)
+        elif self.eager:
             self._update(kind)
-        elif kind in self._graphs:
-            self._graphs[kind].replay()
         else:
-            self._first(kind, self._side)
+            self._captured(kind)
         for name in self._names[kind]:
             self.counts[name] = self.counts.get(name, 0) + 1
+
+    def _captured(self, kind: str) -> None:
+        """Do an update on the CPU: the first of a kind as it is, two recorded, the rest replayed.
+
+        Every RECORD_EVERY-th is recorded again, so that an update that changes later on is noticed.
+        """
+        done = self._done[kind] = self._done.get(kind, 0) + 1
+        if done == 1:
+            self._update(kind)
+        elif done > 3 and done % RECORD_EVERY:
+            with torch.inference_mode():
+                self._recordings[kind].replay()
+        else:
+            where = f"{type(self.algorithm).__name__}.update"
+            try:
+                recording = record(lambda: self._update(kind))
+            except NotCapturableError as error:
+                self._leave_eager(f"{where} cannot be captured ({error})")
+                return
+            if done > 2 and not recording.same_as(self._recordings[kind]):
+                if done > 3:
+                    raise OffbenchError(
+                        f"{where} changes with the number of updates; let `kind` tell apart what differs, or set "
+                        f"`capture = False` in class {type(self.algorithm).__name__}"
+                    )
+                self._leave_eager(f"{where} is not the same at every update of kind {kind!r}")
+            elif done <= 3:
+                self._recordings[kind] = recording
+
+    def _leave_eager(self, reason: str) -> None:
+        self.eager = True
+        self._recordings = {}
+        print(f"offbench: {reason}: every update runs as it is, which is slower", file=sys.stderr)
 
     def _first(self, kind: str, side: Any) -> None:
         """Do one of the first updates of a kind as it is; after a few, capture the kind for those to come."""
@@ -188,8 +229,6 @@ class Stack:
         """Put one run's checkpoint back. Raises OffbenchError if it does not fit."""
         for name, place in self.run_tensors(run).items():
             found = tensors.get(name)
-            if found is None and self.members[run].guest:
-                continue  # what the guest's own algorithm lacks cannot move it either
             if found is None or found.shape != place.shape:
                 raise OffbenchError(f"the checkpoint in {self.members[run].run.folder} does not fit; delete the run")
             with torch.no_grad():

@@ -36,7 +36,7 @@ class Part:
     """Runs that train as one program, whether all of them are still to be trained or not.
 
     Attributes:
-        kind: the algorithm whose program it is; guests of another algorithm are special cases of it.
+        kind: the runs' algorithm.
     """
 
     kind: str
@@ -48,7 +48,7 @@ def cut(orders: Sequence[Order], device: str, processes: int, stack: int | str =
     """Sort runs into stacks.
 
     Args:
-        device: PyTorch's name; on a GPU, runs that are special cases of another algorithm join its stack.
+        device: PyTorch's name.
         processes: how many stacks can train at a time.
         stack: most runs of one, or "auto" for what the device holds.
 
@@ -68,12 +68,7 @@ def cut(orders: Sequence[Order], device: str, processes: int, stack: int | str =
                 f"offbench: {data.dataset_id} names no environment, so nothing is evaluated while training",
                 file=sys.stderr,
             )
-    hosts = {order.algorithm for order in orders} if device != "cpu" else set()
-    paired = []
-    for order in orders:
-        host = order.host if order.host in hosts else order.algorithm
-        paired.append((host, order, order.member(loaded[order.dataset], host)))
-    groups = _alike(paired)
+    groups = _alike([(order, order.member(loaded[order.dataset])) for order in orders])
     parts = []
     for kind, group in groups:
         size = stack_size(load_algorithm(kind), group[0][1], device) if isinstance(stack, str) else stack
@@ -85,20 +80,20 @@ def cut(orders: Sequence[Order], device: str, processes: int, stack: int | str =
     return parts
 
 
-def _alike(paired: Sequence[tuple[str, Order, Member]]) -> list[tuple[str, list[tuple[Order, Member]]]]:
-    """Sort runs by kind, environment, shapes, and the settings that cannot differ within a stack."""
+def _alike(paired: Sequence[tuple[Order, Member]]) -> list[tuple[str, list[tuple[Order, Member]]]]:
+    """Sort runs by algorithm, environment, shapes, and the settings that cannot differ within a stack."""
     groups: list[tuple[Any, Member, str, list[tuple[Order, Member]]]] = []
-    for kind, order, member in paired:
+    for order, member in paired:
         per_run = {name for name, field in fields(type(member.config)).items() if field.metadata.get("per_run")}
         shared = {name: value for name, value in settings_dict(member.config).items() if name not in per_run}
         shapes = member.data.observations.shape[1], member.data.actions.shape[1]
-        key = (kind, shared, shapes)
+        key = (order.algorithm, shared, shapes)
         for known, first, _, group in groups:
             if known == key and same_environment(first.data.env_spec, member.data.env_spec):
                 group.append((order, member))
                 break
         else:
-            groups.append((key, member, kind, [(order, member)]))
+            groups.append((key, member, order.algorithm, [(order, member)]))
     return [(kind, group) for _, _, kind, group in groups]
 
 
@@ -202,7 +197,7 @@ def _check_evaluations(run: Run, every: int) -> None:
 
 def _config(order: Order, member: Member, schedule: Schedule, tf32: bool, command: str) -> dict[str, Any]:
     """Return the run's config.json: all that is needed to repeat it, and to score it without its dataset."""
-    data, config = member.data, order.config()  # a guest's own settings, not those of its stack
+    data, config = member.data, member.config
     constants = d4rl_constants(data.env_id)
     return {
         "format": FORMAT,

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).parent.parent
-PEER = ROOT / ".venv-d3rlpy" / "bin" / "python"
+PEER = ROOT / ".venv-peers" / "bin" / "python"
 FILE = ROOT / "docs" / "results" / "beside-d3rlpy.md"
 DATASET, ENV_ID = "hopper-medium-v0", "Hopper-v5"
 SEEDS, STEPS, EVERY, EPISODES = 2, 50_000, 5_000, 10

@@ -10,8 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import threadpoolctl
+import torch
 
 ROOT = Path(__file__).parent.parent
+
+# pytest-xdist runs a process for each core, so each process computes with one thread
+torch.set_num_threads(1)
+threadpoolctl.threadpool_limits(1)
 
 # A real training, as small as it can be: two seconds, and its expert beats chance.
 TINY_RECIPE = """

@@ -126,27 +126,6 @@ def test_a_run_that_diverges_is_marked_and_the_others_go_on(medium: str) -> None
         offbench.train("td3_bc", medium, steps=300, **common)
 
 
-def test_td3_bc_as_a_guest_in_a_stack_of_bdb_is_td3_bc(medium: str) -> None:
-    """On a GPU the two train as one program. Started as a guest, gone on with alone: the same bits all the way."""
-    schedule = Schedule(200, 100, 2, "cpu", 0)
-    td3_bc, bdb = (orders(medium, "together", 1, algorithm=name)[0] for name in ("td3_bc", "bdb"))
-    own = [td3_bc.member(kind=kind) for kind in ("td3_bc", "bdb")]
-    assert [type(member.config).__module__ for member in own] == ["offbench.algos.td3_bc", "offbench.algos.bdb"]
-    (part,) = cut([replace(td3_bc, seed=3)], "cpu", 1)
-    assert part.kind == "td3_bc"  # on a CPU a guest would only cost more
-    pending(part, schedule)  # claims the run
-    finish([Job("bdb", (replace(td3_bc, seed=3),), replace(schedule, steps=100))])
-    finish([Job("td3_bc", (replace(td3_bc, seed=3),), schedule)])
-    alone = replace(orders(medium, "alone", 1, algorithm="td3_bc")[0], seed=3)
-    finish(jobs_of([alone], schedule, 1))
-    finish([Job("bdb", (replace(td3_bc, seed=3),), replace(schedule, steps=300))])  # and back again
-    finish([Job("td3_bc", (alone,), replace(schedule, steps=300))])
-    ours, theirs = (load_file(Path(o.folder) / "checkpoint-000000300.safetensors") for o in (td3_bc, alone))
-    assert theirs.keys() < ours.keys()
-    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
-    assert bdb.host is None
-
-
 def test_several_networks_in_one_command(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--steps", "2", "--eval-every", "2", "--eval-episodes", "1", "--workers", "1"]
     main(["train", "bc", "--dataset", medium, *words, "--hidden", "8,8", "16x16", "--runs", "my runs"])

@@ -2,7 +2,8 @@
 
 side.py        a side: a process that does its work for so many seconds when told to, and says how much it did
 sides.py       offbench's sides, and those of Stable-Baselines3, Minari, MuJoCo and plain matrix products
-peer.py        d3rlpy's sides, run by an interpreter of their own environment (offbench is not imported there)
+d3rlpy_peer.py, jax_peer.py
+               d3rlpy's and JAX's sides, run in an environment of their own (offbench is not imported there)
 arithmetic.py  the matrix products of an update, counted by hand
 rows.py        which sides make which row, and what is expected
 gpu.py         a stack on a GPU against one run, in slices that resume

@@ -15,7 +15,7 @@ from offbench.files import write_bytes
 from offbench.provenance import hardware, versions
 from offbench.tables import markdown
 from offbench.workers import cores
-from tests.speed.rows import PEER, Row, growth, rows
+from tests.speed.rows import PEERS, Row, growth, rows
 from tests.speed.side import Side
 
 DOCS = Path(__file__).parent.parent.parent / "docs"
@@ -24,7 +24,8 @@ DOCS = Path(__file__).parent.parent.parent / "docs"
 def measure(row: Row, quick: bool) -> dict[str, Any]:
     """Let two sides take turns; return the median ratio, its range, and both sides' rates and memory."""
     seconds, rounds = (0.5, 1) if quick else (row.seconds, row.rounds)
-    ours, theirs = Side([*row.ours], environment()), Side([*row.theirs], environment())
+    core = max(os.sched_getaffinity(0)) if row.pinned and hasattr(os, "sched_getaffinity") else None
+    ours, theirs = (Side([*command], environment(), core) for command in (row.ours, row.theirs))
     try:
         pairs = [(ours.rate(seconds), theirs.rate(seconds)) for _ in range(rounds)]
     finally:
@@ -69,10 +70,13 @@ def line(found: dict[str, Any]) -> list[str]:
 def page(results: list[dict[str, Any]], grown: list[tuple[str, dict[str, Any]]]) -> str:
     """Return the page: the fixed text with this run's tables in it."""
     made = hardware()["hardware"]
-    peer = "d3rlpy 2.8.1"
+    pins = (PEERS.parent.parent / "pins.txt").read_text(encoding="utf-8").split()
+    peers = ", ".join(pin.replace("==", " ") for pin in pins if pin.startswith(("d3rlpy", "jax=", "optax")))
     where = (
         f"{datetime.date.today().isoformat()}, {made['processor']} ({made['vectors']}), {cores()} cores, "
-        f"{platform.system()}; " + ", ".join(f"{name} {version}" for name, version in versions().items()) + f"; {peer}"
+        f"{platform.system()}; "
+        + ", ".join(f"{name} {version}" for name, version in versions().items())
+        + f"; {peers}"
     )
     header = [
         "ours vs theirs",
@@ -108,8 +112,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="half a second a side: does it work? Writes nothing")
     parser.add_argument("--only", default="", help="rows whose name holds this; prints, writes nothing")
     arguments = parser.parse_args()
-    if not PEER.exists():
-        raise SystemExit(f"no {PEER}: run `make bench`, which installs d3rlpy there")
+    if not PEERS.exists():
+        raise SystemExit(f"no {PEERS}: run `make bench`, which installs d3rlpy and JAX there")
     with tempfile.TemporaryDirectory() as place:
         os.environ |= {"MINARI_DATASETS_PATH": f"{place}/minari", "OFFBENCH_CACHE": f"{place}/cache"}
         from offbench.record import collect

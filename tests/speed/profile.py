@@ -5,14 +5,18 @@ Writes docs/results/profile-KIND.md, KIND the processor's vector instructions. O
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import mujoco
-import pytest
+import numpy as np
+import torch
 
-from offbench import networks, perceptron
+from offbench import perceptron
+from offbench.capture import Recording
 from offbench.environments import make_env
 from offbench.files import write_bytes
 from offbench.ladder import read_ladder
@@ -21,16 +25,11 @@ from offbench.recipes import load_recipe
 from offbench.rollout import LANES, Episode, Task, play
 from offbench.tables import markdown
 from tests.speed.__main__ import DOCS
-from tests.speed.sides import ENV, train
+from tests.speed.sides import ENV, stack_of
 
 ROUNDS = 5  # the least of so many is taken: whatever disturbs adds to it
-PRODUCTS, OPTIMISER = "matrix products, biases and activations of the forward passes", "Adam and Polyak averaging"
-WATCHED = [
-    (perceptron, "affine", PRODUCTS),
-    (perceptron, "product", PRODUCTS),
-    (networks.Learned, "descend", OPTIMISER),
-    (networks.Target, "follow", OPTIMISER),
-]
+PRODUCTS, ACTIVATIONS = "matrix products, biases included", "activations and the products with one output's gradient"
+OPTIMISER, REST = "Adam and Polyak averaging", "all else: losses, sampling, copies, overhead of small operations"
 
 
 def recording() -> dict[str, float]:
@@ -76,34 +75,43 @@ def recording() -> dict[str, float]:
 
 
 def update(algorithm: str) -> dict[str, float]:
-    """Return milliseconds of an update (2-layer networks): in matrix products, in the optimiser, and in all else."""
+    """Return milliseconds of an update (2-layer networks), by what a replay calls."""
+    stack = stack_of(algorithm)
+    for _ in stack.train(10):  # records each kind of update
+        pass
+    kinds = [list(calls(recording)) for recording in stack.program._recordings.values()]
     spent: dict[str, float] = {}
+    with torch.inference_mode():
+        for part, call in itertools.chain(*kinds):
+            found = []
+            for _ in range(ROUNDS):
+                began = time.perf_counter()
+                call()
+                found.append(time.perf_counter() - began)
+            spent[part] = spent.get(part, 0.0) + 1e3 * min(found) / len(kinds)
+    return spent
 
-    def timed(owner: Any, name: str, part: str) -> Callable[..., Any]:
-        function = getattr(owner, name)
 
-        def call(*arguments: Any, **named: Any) -> Any:
-            began = time.perf_counter()
-            found = function(*arguments, **named)
-            spent[part] += time.perf_counter() - began
-            return found
-
-        return call
-
-    work = train(algorithm, hidden="256,256")
-    with pytest.MonkeyPatch.context() as patch:
-        for owner, name, part in WATCHED:
-            patch.setattr(owner, name, timed(owner, name, part))
-        found = []
-        for _ in range(ROUNDS):
-            spent = dict.fromkeys((part for _, _, part in WATCHED), 0.0)
-            began = time.perf_counter()
-            updates = work()
-            whole = 1e3 * (time.perf_counter() - began) / updates
-            found.append((whole, {part: 1e3 * seconds / updates for part, seconds in spent.items()}))
-    everything, parts = min(found, key=lambda pair: pair[0])
-    rest = "all else: losses, gradients of activations, sampling, overhead of small operations"
-    return parts | {rest: everything - sum(parts.values())}
+def calls(recording: Recording) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Yield each call of a replay, those within the networks' passes one by one, with the part that it belongs to."""
+    for function, arguments, named in recording.calls:
+        owner = getattr(function, "__self__", None)
+        if isinstance(owner, perceptron.Pass):
+            for into, source in owner._loads:
+                yield REST, partial(np.copyto, into, source)
+            for h, layer, out, activate in owner._steps:
+                yield PRODUCTS, partial(np.matmul, h, layer, out=out)
+                if activate is not None:
+                    yield ACTIVATIONS, activate
+        elif isinstance(owner, perceptron.PassBack):
+            for inner, inputs in owner._calls:
+                yield PRODUCTS if inner is np.matmul else ACTIVATIONS, partial(inner, *inputs)
+        else:
+            name = getattr(function, "__name__", str(function))
+            yield (
+                OPTIMISER if name.startswith(("_fused_adam", "lerp")) else REST,
+                partial(function, *arguments, **named),
+            )
 
 
 def rows(what: str, unit: str, parts: dict[str, float]) -> list[list[str]]:

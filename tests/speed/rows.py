@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from offbench.workers import cores
 
-PEER = Path(__file__).parent.parent.parent / ".venv-d3rlpy" / "bin" / "python"
+PEERS = Path(__file__).parent.parent.parent / ".venv-peers" / "bin" / "python"
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,7 @@ class Row:
     Attributes:
         at_least, aim: of the ratio; None where a row only informs.
         seconds: of a side's turn; sides take turns `rounds` times.
+        pinned: both sides run on one core, the same.
     """
 
     name: str
@@ -26,8 +27,8 @@ class Row:
     at_least: float | None = None
     aim: float | None = None
     seconds: float = 2.0
-    rounds: int = 11
-    environment: dict[str, str] = field(default_factory=dict)
+    rounds: int = 7
+    pinned: bool = False
 
 
 def side(which: str, **arguments: object) -> tuple[str, ...]:
@@ -35,41 +36,33 @@ def side(which: str, **arguments: object) -> tuple[str, ...]:
     return (sys.executable, "-m", "tests.speed.sides", which, *(f"{key}={value}" for key, value in arguments.items()))
 
 
-def peer(algorithm: str) -> tuple[str, ...]:
-    """Return the command of one of d3rlpy's sides."""
-    return (str(PEER), "-m", "tests.speed.peer", "update", f"algorithm={algorithm}")
+def peer(library: str, which: str, algorithm: str) -> tuple[str, ...]:
+    """Return the command of a side of another library: d3rlpy or jax."""
+    return (str(PEERS), "-m", f"tests.speed.{library}_peer", which, f"algorithm={algorithm}")
+
+
+def update_rows() -> list[Row]:
+    """Return the rows of updates, all with networks of two layers."""
+    td3_bc, bdb = (side("train", algorithm=name) for name in ("td3_bc", "bdb"))
+    cql = side("train", algorithm="cql", hidden="256,256")
+    found = [
+        ("td3_bc updates vs JAX", td3_bc, peer("jax", "update", "td3_bc"), 0.85, 1.05),
+        ("td3_bc updates vs d3rlpy", td3_bc, peer("d3rlpy", "update", "td3_bc"), 2.5, 4),
+        ("td3_bc updates vs its matrix products alone", td3_bc, peer("jax", "products", "td3_bc"), 0.6, 0.8),
+        ("bdb updates vs td3_bc", bdb, td3_bc, 0.85, 0.92),
+        ("bdb updates vs its matrix products alone", bdb, peer("jax", "products", "bdb"), None, None),
+        ("cql updates vs JAX", cql, peer("jax", "update", "cql"), 1.3, 1.5),
+        ("cql updates vs d3rlpy", cql, peer("d3rlpy", "update", "cql"), 1.25, 1.5),
+        ("cql updates vs its matrix products alone", cql, peer("jax", "products", "cql"), None, None),
+    ]
+    return [Row(*row, seconds=5.0 if "cql" in row[0] else 2.0, pinned=True) for row in found]
 
 
 def rows(dataset: str) -> list[Row]:
     """Return the rows with a target. `dataset` is a recorded one of a million transitions."""
     n = cores()
-    td3_bc, bdb, cql = (side("train", algorithm=name) for name in ("td3_bc", "bdb", "cql"))
     return [
-        Row("td3_bc updates vs d3rlpy", td3_bc, peer("td3_bc"), 1.7, 2.2),
-        Row("td3_bc updates vs its matrix products alone", td3_bc, side("products", algorithm="td3_bc"), 0.6, 0.8),
-        Row("bdb updates vs td3_bc", bdb, td3_bc, 0.8, 0.92),
-        Row("bdb updates vs its matrix products alone", bdb, side("products", algorithm="bdb")),
-        Row(
-            "cql updates vs d3rlpy (2-layer networks)",
-            side("train", algorithm="cql", hidden="256,256"),
-            peer("cql"),
-            1.25,
-            1.5,
-            5.0,
-        ),
-        Row(
-            "cql updates (2-layer) vs its matrix products alone",
-            cql,
-            side("products", algorithm="cql"),
-            None,
-            None,
-            5.0,
-        ),
-        Row(
-            "CQL's largest matrix product: oneDNN vs torch.bmm",
-            side("product", way="onednn"),
-            side("product", way="bmm"),
-        ),
+        *update_rows(),
         Row(
             f"recording with {n} workers vs SB3 predict + Minari DataCollector",
             side("record", workers=n),

@@ -8,6 +8,7 @@ nothing but the standard library, because d3rlpy's environment runs it too.
 from __future__ import annotations
 
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -35,10 +36,13 @@ def serve(make: Callable[..., Work]) -> None:
 class Side:
     """The parent's end of a side."""
 
-    def __init__(self, command: list[str], environment: dict[str, str]) -> None:
+    def __init__(self, command: list[str], environment: dict[str, str], core: int | None = None) -> None:
+        """Start `command`; with `core`, it and all its threads run on that core alone (Linux)."""
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         )
+        if core is not None and hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(self.process.pid, {core})
         self.memory = 0.0
         if self._answer() != "ready":
             raise SystemExit(f"{' '.join(command)} did not start")

@@ -8,21 +8,34 @@ import multiprocessing
 import os
 import shutil
 import sys
-import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tests.speed.side import Work, serve
 
+if TYPE_CHECKING:
+    from offbench.stack import Stack
+
 ENV = "hopper"
-BATCH, HIDDEN = 256, (256, 256)
 ARITHMETIC = contextlib.ExitStack()  # what trainings set; left as this process ends
 
 
 def train(algorithm: str, runs: str = "1", rows: str = "100000", hidden: str = "256,256") -> Work:
     """Updates of a stack; a unit is one run's update."""
+    stack = stack_of(algorithm, int(runs), int(rows), hidden)
+    few = 5 if algorithm == "cql" else 100
+
+    def work() -> int:
+        for _ in stack.train(stack.step + few):
+            pass
+        return few * len(stack.members)
+
+    return work
+
+
+def stack_of(algorithm: str, runs: int = 1, rows: int = 100_000, hidden: str = "256,256") -> Stack:
+    """A stack on random transitions of hopper's shapes."""
     from offbench.devices import arithmetic
     from offbench.registry import load_algorithm
     from offbench.settings import build
@@ -31,16 +44,7 @@ def train(algorithm: str, runs: str = "1", rows: str = "100000", hidden: str = "
     ARITHMETIC.enter_context(arithmetic("cpu", tf32=False))
     kind = load_algorithm(algorithm)
     config: Any = build(kind.Config, {"hidden": hidden} | ({"bc_steps": 0} if algorithm == "cql" else {}), algorithm)
-    member = _member(algorithm, config, int(rows))
-    stack = Stack(kind, [member] * int(runs), "cpu")
-    few = 5 if algorithm == "cql" else 100
-
-    def work() -> int:
-        for _ in stack.train(stack.step + few):
-            pass
-        return few * int(runs)
-
-    return work
+    return Stack(kind, [_member(algorithm, config, rows)] * runs, "cpu")
 
 
 def _member(algorithm: str, config: Any, rows: int) -> Any:
@@ -50,68 +54,6 @@ def _member(algorithm: str, config: Any, rows: int) -> Any:
 
     calibrate.ROWS = rows
     return calibrate.made_up(algorithm, config, load_recipe(ENV).env_spec())
-
-
-def products(algorithm: str) -> Work:
-    """The matrix products of an update and nothing else, each the fastest way there is; a unit is one update."""
-    import torch
-
-    from offbench.perceptron import HAS_ONEDNN
-    from tests.speed.arithmetic import ALGORITHMS
-
-    torch.set_num_threads(1)
-    counted: dict[Any, float] = {}
-    for often, product in ALGORITHMS[algorithm](11, 3, BATCH, HIDDEN):
-        counted[product] = counted.get(product, 0) + often
-    calls: list[Callable[[], object]] = []
-    for (copies, m, k, n), often in counted.items():
-        a, b, out = torch.randn(copies, m, k), torch.randn(copies, k, n), torch.empty(copies, m, n)
-        ways = [partial(torch.bmm, a, b, out=out)]
-        if HAS_ONEDNN:
-            ways.append(partial(_onednn, a, b.transpose(1, 2).contiguous()))  # the layout it likes best
-        calls += [min(ways, key=_seconds)] * round(2 * often)  # two updates: some come every second one
-
-    def work() -> int:
-        for call in calls:
-            call()
-        return 2
-
-    return work
-
-
-def product(way: str) -> Work:
-    """The largest product of CQL's critics, 2 x [7680, 256] @ [256, 256]; a unit is one."""
-    import torch
-
-    torch.set_num_threads(1)
-    a, b, out = torch.randn(2, 7680, 256), torch.randn(2, 256, 256), torch.empty(2, 7680, 256)
-
-    def work() -> int:
-        if way == "onednn":
-            _onednn(a, b)
-        else:
-            torch.bmm(a, b.mT, out=out)
-        return 1
-
-    return work
-
-
-def _onednn(a: Any, b: Any) -> None:
-    """[copies, m, k] @ [copies, n, k]^T by oneDNN, one copy after the other."""
-    import torch
-
-    for one, other in zip(a, b, strict=True):
-        torch.ops.mkldnn._linear_pointwise(one, other, None, "none", [], "")
-
-
-def _seconds(call: Callable[[], object]) -> float:
-    """Return the least seconds of a few calls."""
-    found = []
-    for _ in range(20):
-        began = time.perf_counter()
-        call()
-        found.append(time.perf_counter() - began)
-    return min(found)
 
 
 def record(workers: str) -> Work:
@@ -293,8 +235,6 @@ SIDES: dict[str, Callable[..., Work]] = {
     side.__name__: side
     for side in (
         train,
-        products,
-        product,
         record,
         sb3_collector,
         physics,

@@ -1,4 +1,4 @@
-"""d3rlpy's sides, for the interpreter of its own environment: `python -m tests.speed.peer NAME`.
+"""d3rlpy's sides, for the interpreter of its own environment: `python -m tests.speed.d3rlpy_peer NAME`.
 
 It imports no offbench. A module of the package, not a script, whose folder would come before the standard library.
 """

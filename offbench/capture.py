@@ -1,0 +1,222 @@
+"""Capture: an update is recorded once on the CPU and then replayed without Python's and autograd's overhead.
+
+What a CUDA graph is on a GPU: every operation of an update, below autograd, is recorded with the tensors that it
+reads and writes, and replayed with them. Views are made once, outputs stay in place, and nothing is allocated. The
+same kernels run in the same order on the same numbers, so a replayed update has the bits of an eager one.
+
+An update can be replayed if it always does the same operations: it may not read numbers into Python, draw random
+numbers, or depend on a counter of its own. `record` notices the first two, comparing two records the third.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+from torch.utils._pytree import tree_map_only
+
+Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+_UNREPEATABLE = {
+    torch.Tag.nondeterministic_seeded,  # random numbers
+    torch.Tag.data_dependent_output,  # .item()
+    torch.Tag.dynamic_output_shape,  # nonzero()
+}
+_ACTIVE = threading.local()
+
+
+class NotCapturableError(Exception):
+    """An update does something that a replay would not repeat."""
+
+
+class Recording:
+    """The operations of one update, to be replayed in place.
+
+    Attributes:
+        calls: what a replay calls, in order.
+        key: what was recorded, comparable between two records of the same update.
+        outside: tensors that were there before the record, in order of their first use.
+    """
+
+    def __init__(self) -> None:
+        self.calls: list[Call] = []
+        self.key: list[Any] = []
+        self.outside: list[Tensor] = []
+        self._kept: list[Any] = []  # no storage of the record is freed and used again
+        self._origins: dict[int, tuple[str, int]] = {}  # of a storage's address: the call that made it, or `outside`
+
+    def replay(self) -> None:
+        """Do the update once more. Call it within `torch.inference_mode()`."""
+        for function, arguments, named in self.calls:
+            function(*arguments, **named)
+
+    def same_as(self, other: Recording) -> bool:
+        """Return whether two records do the same with the same numbers."""
+        return (
+            self.key == other.key
+            and len(self.outside) == len(other.outside)
+            and all(
+                a.data_ptr() == b.data_ptr() or (a.shape == b.shape and torch.equal(a, b))
+                for a, b in zip(self.outside, other.outside, strict=True)
+            )
+        )
+
+    def add(self, name: Any, reads: Any, writes: Any, call: Call) -> None:
+        """Add one call; `reads` and `writes` are nested tensors and plain values."""
+        described = tree_map_only(Tensor, self._describe, reads)
+        origin = ("call", len(self.calls))
+        for tensor in _tensors(writes):
+            self._origins.setdefault(_address(tensor), origin)
+        self.key.append((name, described))
+        self._kept.append((reads, writes))
+        self.calls.append(call)
+
+    def keep(self, tensors: Any) -> None:
+        """Keep tensors alive as long as this record."""
+        self._kept.append(tensors)
+
+    def _describe(self, tensor: Tensor) -> Any:
+        address = _address(tensor)
+        if address not in self._origins:
+            self._origins[address] = ("outside", len(self.outside))
+            self.outside.append(tensor)
+        return (
+            self._origins[address],
+            tensor.storage_offset(),
+            tuple(tensor.shape),
+            tensor.stride(),
+            str(tensor.dtype),
+        )
+
+
+def record(update: Callable[[], Any]) -> Recording:
+    """Do an update, and return what it did.
+
+    Raises:
+        NotCapturableError: it was done, but cannot be replayed.
+    """
+    recording = Recording()
+    mode = _Recorder(recording)
+    _ACTIVE.recording = recording
+    try:
+        with mode:
+            update()
+    finally:
+        _ACTIVE.recording = None
+    if mode.problem:
+        raise NotCapturableError(mode.problem)
+    return recording
+
+
+@contextmanager
+def one_call() -> Iterator[Recording | None]:
+    """Make what is done within one call of the record, which the caller adds to it; None if nothing is recorded."""
+    recording: Recording | None = getattr(_ACTIVE, "recording", None)
+    if recording is None:
+        yield None
+    else:
+        with _disable_current_modes():
+            yield recording
+
+
+class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Does each operation and adds it to a recording."""
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.recording, self.problem = recording, ""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        result = func(*args, **kwargs)
+        if _UNREPEATABLE & set(func.tags):
+            self.problem = self.problem or f"it calls {func}"
+        elif func._schema.is_mutable:
+            self.recording.add(func, (args, kwargs), (), (func, args, kwargs))
+        elif _is_view(result, (args, kwargs)) or func.overloadpacket.__name__.startswith("empty"):
+            self.recording.keep(result)
+        else:
+            call = _in_place(func, args, kwargs, result)
+            self.recording.add(func, (args, kwargs), result, call)
+        return result
+
+
+def _tensors(nested: Any) -> list[Tensor]:
+    found: list[Tensor] = []
+    tree_map_only(Tensor, found.append, nested)
+    return found
+
+
+def _address(tensor: Tensor) -> int:
+    return tensor.untyped_storage().data_ptr() or id(tensor.untyped_storage())
+
+
+def _is_view(result: Any, inputs: Any) -> bool:
+    """Return whether an operation only returned its inputs' memory."""
+    if not isinstance(result, Tensor):
+        outputs = _tensors(result)
+        return not outputs or all(_is_view(output, inputs) for output in outputs)
+    address = _address(result)
+    return any(address == _address(tensor) for tensor in _tensors(inputs))
+
+
+_OUT: dict[Any, tuple[Callable[..., Any], list[str]] | None] = {}  # the variant that writes in place, by operation
+
+
+def _in_place(func: Any, args: Any, kwargs: Any, result: Any) -> Call:
+    """Return the call that does the same and writes into `result`."""
+    outputs = [result] if isinstance(result, Tensor) else list(result)
+    if func not in _OUT:
+        _OUT[func] = next(
+            (variant for variant in _variants(func, len(outputs)) if _agrees(variant, args, kwargs, outputs)),
+            None,
+        )
+    found = _OUT[func]
+    if found is not None:
+        function, names = found
+        if len(names) == 1 or function is not getattr(torch, func.overloadpacket.__name__, None):
+            return function, args, {**kwargs, **dict(zip(names, outputs, strict=True))}
+        return function, args, {**kwargs, "out": tuple(outputs)}
+
+    def copy(*arguments: Any, **named: Any) -> None:
+        again = func(*arguments, **named)
+        for output, new in zip(outputs, [again] if isinstance(again, Tensor) else again, strict=True):
+            output.copy_(new)
+
+    return copy, args, kwargs
+
+
+def _variants(func: Any, count: int) -> Iterator[tuple[Callable[..., Any], list[str]]]:
+    """Yield the ways to call an operation with outputs given: PyTorch's own function first, it costs least."""
+    native = getattr(torch, func.overloadpacket.__name__, None)
+    if native is not None and count == 1:
+        yield native, ["out"]
+    for name in func.overloadpacket.overloads():
+        overload = getattr(func.overloadpacket, name)
+        names = [a.name for a in overload._schema.arguments if a.alias_info is not None and a.alias_info.is_write]
+        inputs = [a.name for a in overload._schema.arguments if a.name not in names]
+        if len(names) == count and inputs == [a.name for a in func._schema.arguments]:
+            yield overload, names
+
+
+def _agrees(variant: tuple[Callable[..., Any], list[str]], args: Any, kwargs: Any, outputs: Sequence[Tensor]) -> bool:
+    """Return whether a variant writes the same bits as the operation gave."""
+    function, names = variant
+    trial = [torch.empty_like(output) for output in outputs]
+    try:
+        function(*args, **kwargs, **dict(zip(names, trial, strict=True)))
+    except (TypeError, RuntimeError, NotImplementedError):
+        return False
+    return all(
+        new.shape == old.shape and new.stride() == old.stride() and torch.equal(_bits(new), _bits(old))
+        for new, old in zip(trial, outputs, strict=True)
+    )
+
+
+def _bits(tensor: Tensor) -> Tensor:
+    """Return a tensor whose equality is that of the bits, NaN included."""
+    return tensor.contiguous().view(torch.uint8) if tensor.dim() else tensor.reshape(1).view(torch.uint8)
