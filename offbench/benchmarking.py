@@ -93,7 +93,7 @@ def benchmark(
     jobs = [
         replace(job, cost=plan.update_seconds.get(job.kind, 1.0))
         for part, schedule in parts
-        for job in pending(part, replace(schedule, deadline=deadline), tf32=bench.tf32, command=command)
+        for job in pending(part, replace(schedule, deadline=deadline), command=command)
     ]
     jobs.sort(key=lambda job: job.work, reverse=True)  # a long one begun last would run beside idle ones
     if bench.device != "cpu":
@@ -101,7 +101,7 @@ def benchmark(
     for line in diverged([part for part, _ in parts]):  # known since an earlier call, which failed for it
         say(line)
     complain(executor.train(jobs, bench.processes) if jobs else [])
-    return not any(pending(part, schedule, tf32=bench.tf32, command=command) for part, schedule in parts)
+    return not any(pending(part, schedule, command=command) for part, schedule in parts)
 
 
 def _seconds(text: str) -> float:
@@ -122,7 +122,9 @@ def _parts(bench: Benchmark, shard: tuple[int, int]) -> list[tuple[Part, Schedul
         by_times.setdefault(replace(one.times, seeds=()), []).extend(orders)
     found = []
     for times, orders in by_times.items():
-        schedule = Schedule(times.steps, times.eval_every, times.eval_episodes, bench.device, workers=0)
+        schedule = Schedule(
+            times.steps, times.eval_every, times.eval_episodes, bench.device, workers=0, precision=bench.precision
+        )
         found += [(part, schedule) for part in cut(orders, bench.device, bench.processes, bench.stack)]
     return found
 

@@ -12,7 +12,7 @@ import numpy as np
 from offbench.batches import Member
 from offbench.devices import arithmetic, stack_size
 from offbench.environments import make_env
-from offbench.perceptron import only_pytorch
+from offbench.perceptron import products_by
 from offbench.registry import load_algorithm
 from offbench.runs import Run
 from offbench.stack import WARM_UP, Stack
@@ -39,14 +39,16 @@ class Rate:
     bytes_per_run: int
 
 
-def measure(algorithm: str, config: Any, spec: str, device: str, *, tf32: bool = False, stack: int = 0) -> Rate:
+def measure(
+    algorithm: str, config: Any, spec: str, device: str, *, precision: str = "float32", stack: int = 0
+) -> Rate:
     """Time an algorithm's updates on made-up data of an environment's shapes, for half a second or more.
 
     Args:
         stack: runs together; 0 for one on a CPU and for what fits on a GPU.
     """
     kind, member = load_algorithm(algorithm), made_up(algorithm, config, spec)
-    with arithmetic(device, tf32):
+    with arithmetic(device, precision):
         runs = stack or (1 if device == "cpu" else stack_size(kind, member, device))
         learning = Stack(kind, [member] * runs, device)
         wanted = 2 * WARM_UP + 2
@@ -71,7 +73,7 @@ def operations(algorithm: str, config: Any, spec: str) -> float:
     learning.program.eager = True
     for _ in learning.train(2 * WARM_UP):  # past whatever happens only once
         pass
-    with only_pytorch(), FlopCounterMode(display=False) as counter:
+    with products_by("pytorch"), FlopCounterMode(display=False) as counter:
         for _ in learning.train(2 * WARM_UP + COUNTED):
             pass
     return float(counter.get_total_flops()) / COUNTED

@@ -13,9 +13,12 @@ import torch
 from offbench.algorithm import Algorithm
 from offbench.batches import Member
 from offbench.errors import OffbenchError
+from offbench.perceptron import products_by
+from offbench.provenance import has_bfloat16
 from offbench.stack import WARM_UP, Stack
 
 CPU_STACK = 8  # runs of one process: more gain nothing there, and each waits for all
+PRECISIONS = ("float32", "tf32", "bfloat16")
 MEMORY_SHARE = 0.8  # of a GPU's free memory that a stack may take
 
 
@@ -38,17 +41,37 @@ def pick_device(device: str) -> str:
     return device
 
 
+def check_precision(precision: str, device: str) -> None:
+    """Raise OffbenchError if a device (cpu or cuda:N) has no such matrix products."""
+    if precision not in PRECISIONS:
+        raise OffbenchError(f"precision must be {', '.join(PRECISIONS[:-1])} or {PRECISIONS[-1]}, not {precision!r}")
+    if precision == "tf32" and device == "cpu":
+        raise OffbenchError("precision tf32 is of GPUs; use float32 on a CPU")
+    native = has_bfloat16() if device == "cpu" else torch.cuda.is_bf16_supported(including_emulation=False)
+    if precision == "bfloat16" and not native:
+        what = "this processor" if device == "cpu" else f"this GPU ({torch.cuda.get_device_name(device)})"
+        raise OffbenchError(f"{what} cannot multiply bfloat16 numbers natively; use float32")
+
+
 @contextmanager
-def arithmetic(device: str, tf32: bool) -> Iterator[None]:
+def arithmetic(device: str, precision: str = "float32") -> Iterator[None]:
     """Set threads and precision of matrix products for a training, and put them back after it.
 
-    On the CPU one thread, NumPy's products included: two runs in two processes beat one run on two threads. On a GPU
-    float32, or TF32 (10 bits of mantissa, several times faster) where the user asks for it.
+    On the CPU one thread, NumPy's products included: two runs in two processes beat one run on two threads.
+
+    Args:
+        precision: float32, tf32 (float32 with 10 bits of mantissa in products) or bfloat16 (`perceptrons`).
+
+    Raises:
+        OffbenchError: the device has no such products.
     """
-    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high" if tf32 else "highest")
+    check_precision(precision, device)
+    threads, before = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if precision == "tf32" else "highest")
     with ExitStack() as undo:
-        undo.callback(torch.set_float32_matmul_precision, precision)
+        undo.callback(torch.set_float32_matmul_precision, before)
+        if precision == "bfloat16":
+            undo.enter_context(products_by("bfloat16"))
         if device == "cpu":
             torch.set_num_threads(1)
             undo.callback(torch.set_num_threads, threads)

@@ -64,7 +64,6 @@ class Job:
     kind: str
     orders: tuple[Order, ...]
     schedule: Schedule
-    tf32: bool = False
     cost: float = 1.0
 
     @property
@@ -97,8 +96,8 @@ def perform(job: Job, report: Report) -> list[str]:
 
     loaded = {name: transitions.load(name) for name in dict.fromkeys(order.dataset for order in job.orders)}
     members = [order.member(loaded[order.dataset]) for order in job.orders]
-    with arithmetic(job.schedule.device, job.tf32):
-        return Trainer(load_algorithm(job.kind), members, job.schedule, job.tf32).train(report)
+    with arithmetic(job.schedule.device, job.schedule.precision):
+        return Trainer(load_algorithm(job.kind), members, job.schedule).train(report)
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any
 
 from offbench import checkpoints, transitions
 from offbench.batches import Member
-from offbench.devices import pick_device
+from offbench.devices import check_precision, pick_device
 from offbench.errors import OffbenchError, unknown
 from offbench.jobs import Job, Order, complain, run_jobs
 from offbench.loggers import Destinations
@@ -36,7 +36,7 @@ def train(
     device: str = "auto",
     workers: int | None = None,
     stack: int | str = "auto",
-    tf32: bool = False,
+    precision: str = "float32",
     runs: str | Path = "runs",
     tensorboard: bool = False,
     wandb: str | None = None,
@@ -55,7 +55,8 @@ def train(
         workers: processes (default: one a core). Several runs on a CPU train in as many processes; one run, or a
             GPU, has them for its evaluations.
         stack: most runs that train as one program; "auto" follows the device's memory.
-        tf32: on a GPU, matrix products in TF32: faster, less precise; written into each run's config.json.
+        precision: of matrix products: float32, tf32 (GPUs) or bfloat16 (GPUs, and processors that multiply it
+            natively). Weights, Adam, targets, losses and normalization are float32 in each.
         runs: the folder of all run directories.
         tensorboard: write TensorBoard event files into each run's folder `tensorboard`.
         wandb: a Weights & Biases project to show the runs in.
@@ -76,23 +77,24 @@ def train(
     names = [dataset] if isinstance(dataset, str) else list(dict.fromkeys(dataset))
     if not names:
         raise OffbenchError("give at least one dataset")
+    place = pick_device(device)
+    check_precision(precision, place)
     orders = [
         Order(
             algorithm,
             name,
             settings_dict(config),
             seed,
-            str(run_folder(Path(runs), name, algorithm, variant(config), seed)),
+            str(run_folder(Path(runs), name, algorithm, variant(config, precision), seed)),
         )
         for name, config, seed in itertools.product(names, configs, seed_list)
     ]
     show = Destinations(tensorboard, wandb)
     show.check()
-    place = pick_device(device)
     processes = default_workers(workers) if place == "cpu" else 1
-    schedule = Schedule(steps, eval_every, eval_episodes, place, workers=0, show=show)
+    schedule = Schedule(steps, eval_every, eval_episodes, place, workers=0, show=show, precision=precision)
     parts = cut(orders, place, processes, stack)
-    jobs = [job for part in parts for job in pending(part, schedule, tf32=tf32, command=command)]
+    jobs = [job for part in parts for job in pending(part, schedule, command=command)]
     _say_finished(parts, jobs)
     if place != "cpu":
         jobs = with_evaluators(jobs, default_workers(workers))

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from offbench.capture import one_call
 
-_ONLY_PYTORCH = ContextVar("only_pytorch", default=False)
+_WAY = ContextVar("way", default="numpy")
 Array = np.ndarray[Any, np.dtype[np.float32]]
 ALIGNED = 16  # float32 numbers of 64 bytes: rows of buffers begin where a processor's wide registers do
 
@@ -42,33 +42,64 @@ def perceptrons(flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], ac
         inputs: each [runs, batch, dim].
         activation: of the hidden layers, relu or tanh.
     """
-    if flat.device.type != "cpu" or flat.dtype != torch.float32 or _ONLY_PYTORCH.get():
+    way = _WAY.get()
+    if way == "bfloat16":
+        return _in_bfloat16(flat, inputs, sizes, activation)
+    if flat.device.type != "cpu" or flat.dtype != torch.float32 or way == "pytorch":
         return stacked(flat, inputs, sizes, activation)
     outputs: Tensor = _Perceptrons.apply(flat, tuple(sizes), activation, *inputs)  # type: ignore[no-untyped-call]
     return outputs
 
 
 @contextmanager
-def only_pytorch() -> Iterator[None]:
-    """Leave all products to PyTorch, whose tools do not see NumPy's."""
-    token = _ONLY_PYTORCH.set(True)
+def products_by(way: str) -> Iterator[None]:
+    """Choose how `perceptrons` multiplies.
+
+    Args:
+        way: `numpy` on a CPU, the default; `pytorch`, whose tools do not see NumPy's products; or `bfloat16`.
+    """
+    token = _WAY.set(way)
     try:
         yield
     finally:
-        _ONLY_PYTORCH.reset(token)
+        _WAY.reset(token)
 
 
-def stacked(flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str) -> Tensor:
-    """Return what `perceptrons` does, all of them at once, differentiable as often as one likes."""
+def _in_bfloat16(flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str) -> Tensor:
+    """Return what `perceptrons` does, with products in bfloat16; on a CPU one perceptron goes after the other."""
+    if flat.device.type != "cpu":
+        return stacked(flat, inputs, sizes, activation, torch.bfloat16)
+    copies, runs = flat.shape[:2]
+    outputs = [
+        stacked(flat[copy, run][None, None], [x[run : run + 1] for x in inputs], sizes, activation, torch.bfloat16)
+        for copy, run in itertools.product(range(copies), range(runs))
+    ]
+    return torch.cat(outputs).view(copies, runs, *outputs[0].shape[2:])
+
+
+def stacked(
+    flat: Tensor,
+    inputs: Sequence[Tensor],
+    sizes: Sequence[int],
+    activation: str,
+    dtype: torch.dtype | None = None,
+) -> Tensor:
+    """Return what `perceptrons` does, all of them at once, differentiable as often as one likes.
+
+    Args:
+        dtype: of all products but the last layer's; by default that of `flat`, as the last layer's always is: a Q of
+            300 needs more than bfloat16's 8 bits.
+    """
     x = torch.cat(list(inputs), -1)
     copies, (runs, batch, width) = flat.shape[0], x.shape
     h = x.expand(copies, runs, batch, width).reshape(copies * runs, batch, width)
     layers = _layers(flat.reshape(copies * runs, -1), sizes)
-    for layer, both in enumerate(layers):
-        h = torch.baddbmm(both[:, -1:], h, both[:, :-1])
-        if layer < len(layers) - 1:
-            h = h.relu() if activation == "relu" else h.tanh()
-    return h.view(copies, runs, batch, -1)
+    for both in layers[:-1]:
+        both = both.to(dtype or flat.dtype)
+        h = torch.baddbmm(both[:, -1:], h.to(both.dtype), both[:, :-1])
+        h = h.relu() if activation == "relu" else h.tanh()
+    last = layers[-1]
+    return torch.baddbmm(last[:, -1:], h.to(last.dtype), last[:, :-1]).view(copies, runs, batch, -1)
 
 
 def _layers(flat: Tensor, sizes: Sequence[int]) -> list[Tensor]:

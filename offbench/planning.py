@@ -13,7 +13,7 @@ import numpy as np
 from offbench import dataset
 from offbench.calibrate import Rate, measure, operations, step_seconds
 from offbench.consistency import check_recorded
-from offbench.devices import pick_device
+from offbench.devices import check_precision, pick_device
 from offbench.environments import believed_env, make_env
 from offbench.errors import OffbenchError
 from offbench.grid import Entry, Grid, Source, Times, load_grid
@@ -57,7 +57,7 @@ class Benchmark:
     runs: Path
     device: str
     workers: int
-    tf32: bool = False
+    precision: str = "float32"
     stack: int | str = "auto"
 
     @property
@@ -67,7 +67,7 @@ class Benchmark:
 
     def orders(self, one: Variant) -> list[Order]:
         """Return a variant's runs on every dataset."""
-        settings, name = settings_dict(one.config), variant(one.config)
+        settings, name = settings_dict(one.config), variant(one.config, self.precision)
         return [
             Order(
                 one.algorithm,
@@ -98,14 +98,14 @@ def prepare(
     device: str = "auto",
     workers: int | None = None,
     stack: int | str = "auto",
-    tf32: bool = False,
+    precision: str = "float32",
 ) -> Benchmark:
     """Read and check a grid.
 
     Args:
         grid: a shipped grid's name or a file (`./mine.toml`).
         runs: the folder of all run directories.
-        device, workers, stack, tf32: as in `train`.
+        device, workers, stack, precision: as in `train`.
 
     Raises:
         OffbenchError: anything wrong in it.
@@ -119,7 +119,8 @@ def prepare(
     for source in read.datasets:
         check_recorded(source)
     place = pick_device(device)
-    return Benchmark(read, tuple(variants), Path(runs), place, default_workers(workers), tf32, stack)
+    check_precision(precision, place)
+    return Benchmark(read, tuple(variants), Path(runs), place, default_workers(workers), precision, stack)
 
 
 def _configs(entry: Entry) -> list[Any]:
@@ -166,7 +167,7 @@ class Plan:
 
     def _variant(self, one: Variant, runs: int, spec: str, play: float) -> str:
         bench, times = self.bench, one.times
-        rate = measure(one.algorithm, one.config, spec, bench.device, tf32=bench.tf32)
+        rate = measure(one.algorithm, one.config, spec, bench.device, precision=bench.precision)
         each = _cost(times, rate, play, spec)
         self.update_seconds[one.algorithm] = each / times.steps
         cost = runs * each / bench.processes

@@ -33,9 +33,18 @@ def hardware() -> dict[str, Any]:
     return {"hardware": processor | {"cores": os.cpu_count(), "machine": platform.machine()}}
 
 
-def made_with(device: str, tf32: bool) -> dict[str, Any]:
+def made_with(device: str, precision: str) -> dict[str, Any]:
     """Return what a training's numbers depend on beside its settings and seed."""
-    return {"device": device, "tf32": tf32, "versions": versions(), **hardware()}
+    return {"device": device, "precision": precision, "versions": versions(), **hardware()}
+
+
+def has_bfloat16() -> bool:
+    """Return whether this processor multiplies bfloat16 numbers natively: AVX512_BF16, AMX, or ARM's BF16 (Linux)."""
+    try:
+        known = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return False
+    return bool({"avx512_bf16", "amx_bf16", "bf16"} & set(known.split()))
 
 
 def _processor() -> str:

@@ -268,13 +268,18 @@ def folder_name(variant: str) -> str:
     return variant.encode()[: LONGEST - len(ending)].decode(errors="ignore") + ending
 
 
-def variant(config: Any) -> str:
-    """Name a config by the settings that differ from their defaults: `default` or `alpha=1,beta=0.5`."""
+def variant(config: Any, precision: str = "float32") -> str:
+    """Name a config by the settings that differ from their defaults: `default` or `alpha=1,beta=0.5`.
+
+    A precision other than float32 is the last of them: `beta=0.5,precision=bfloat16`.
+    """
     parts = []
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if value != field.default:
             parts.append(f"{field.name}={_word(value)}")
+    if precision != "float32":
+        parts.append(f"precision={precision}")
     return ",".join(parts) or "default"
 
 

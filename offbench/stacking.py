@@ -97,21 +97,21 @@ def _alike(paired: Sequence[tuple[Order, Member]]) -> list[tuple[str, list[tuple
     return [(kind, group) for _, _, kind, group in groups]
 
 
-def pending(part: Part, schedule: Schedule, *, tf32: bool = False, command: str = "") -> list[Job]:
+def pending(part: Part, schedule: Schedule, *, command: str = "") -> list[Job]:
     """Claim the runs' directories, and return what is left to train of them.
 
     Raises:
         OffbenchError: another run lives in a run's directory, one lacks files, or is further than the schedule goes.
     """
     for order, member in zip(part.orders, part.members, strict=True):
-        member.run.claim(_config(order, member, schedule, tf32, command))
+        member.run.claim(_config(order, member, schedule, command))
         _check_environment(member)
         if member.data.env_spec:
             _check_evaluations(member.run, schedule.eval_every)
     order_of = {member.run.folder: order for order, member in zip(part.orders, part.members, strict=True)}
     left = [member for member in part.members if not member.run.diverged]
     stages = together(left, schedule.steps)
-    return [Job(part.kind, tuple(order_of[m.run.folder] for m in stage), schedule, tf32) for stage in stages]
+    return [Job(part.kind, tuple(order_of[m.run.folder] for m in stage), schedule) for stage in stages]
 
 
 def diverged(parts: Sequence[Part]) -> list[str]:
@@ -195,14 +195,14 @@ def _check_evaluations(run: Run, every: int) -> None:
             )
 
 
-def _config(order: Order, member: Member, schedule: Schedule, tf32: bool, command: str) -> dict[str, Any]:
+def _config(order: Order, member: Member, schedule: Schedule, command: str) -> dict[str, Any]:
     """Return the run's config.json: all that is needed to repeat it, and to score it without its dataset."""
     data, config = member.data, member.config
     constants = d4rl_constants(data.env_id)
     return {
         "format": FORMAT,
         "algorithm": order.algorithm,
-        "variant": variant(config),
+        "variant": variant(config, schedule.precision),
         "settings": settings_dict(config),
         "dataset": data.dataset_id,
         "dataset_sha256": data.content,
@@ -217,5 +217,5 @@ def _config(order: Order, member: Member, schedule: Schedule, tf32: bool, comman
         "env_id": data.env_id,
         "env_spec": data.env_spec,
         "command": command.encode("utf-8", "backslashreplace").decode(),  # a path may hold bytes that are not UTF-8
-        **made_with(schedule.device, tf32),
+        **made_with(schedule.device, schedule.precision),
     }

@@ -59,16 +59,15 @@ class Schedule:
     workers: int
     deadline: float | None = None
     show: Destinations = NOWHERE
+    precision: str = "float32"
 
 
 class Trainer:
     """A stack with its files: checkpoints, losses, evaluations beside the training."""
 
-    def __init__(
-        self, kind: type[Algorithm], members: Sequence[Member], schedule: Schedule, tf32: bool = False
-    ) -> None:
+    def __init__(self, kind: type[Algorithm], members: Sequence[Member], schedule: Schedule) -> None:
         self.members, self.schedule = list(members), schedule
-        self.made = made_with(schedule.device, tf32)
+        self.made = made_with(schedule.device, schedule.precision)
         self.stack = Stack(kind, members, schedule.device)
         self.loggers = Loggers([member.run for member in members], schedule.show)
         self.evaluations: list[dict[int, list[tuple[float, int]]]] = [{} for _ in members]

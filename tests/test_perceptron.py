@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from offbench.perceptron import only_pytorch, perceptrons, stacked
+from offbench.perceptron import perceptrons, products_by, stacked
 
 ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
 SHAPES = [((5, 7, 6, 2), 11), ((14, 128, 96, 1), 128), ((3, 4), 1)]  # the last has no hidden layer
@@ -136,6 +136,6 @@ def test_pytorch_sees_all_products_where_it_is_asked_to() -> None:
 
     sizes, batch = SHAPES[1]
     flat, inputs, _ = made(sizes, batch, 1, 1)
-    with only_pytorch(), FlopCounterMode(display=False) as counter:
+    with products_by("pytorch"), FlopCounterMode(display=False) as counter:
         perceptrons(flat.float(), [x.float() for x in inputs], sizes, "relu")
     assert counter.get_total_flops() == 2 * batch * (14 * 128 + 128 * 96 + 96 * 1)

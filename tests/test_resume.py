@@ -18,6 +18,7 @@ import offbench
 from offbench import checkpoints, cli
 from offbench.errors import OffbenchError
 from offbench.registry import algorithm_names
+from offbench.results import read_results
 from offbench.runs import Run
 
 SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 100, "eval_episodes": 2, "workers": 1}
@@ -44,10 +45,11 @@ def assert_same_files(one: Run, other: Run) -> None:
 
 
 @pytest.mark.parametrize("algorithm", sorted(EXTRA))
-def test_a_run_stopped_and_resumed_ends_with_the_same_bits(medium: str, algorithm: str) -> None:
-    (whole,) = train(algorithm, medium, "whole", 300)
+def test_a_run_stopped_and_resumed_ends_with_the_same_bits(medium: str, algorithm: str, precision: str) -> None:
+    (whole,) = train(algorithm, medium, "whole", 300, precision=precision)
+    assert whole.config()["precision"] == precision
     for steps in (100, 200, 300):
-        (pieces,) = train(algorithm, medium, "pieces", steps)
+        (pieces,) = train(algorithm, medium, "pieces", steps, precision=precision)
     assert whole.policy_path.read_bytes() == pieces.policy_path.read_bytes()
     assert whole.evaluations_path.read_bytes() == pieces.evaluations_path.read_bytes()
     ours, theirs = (load_file(run.folder / "checkpoint-000000300.safetensors") for run in (whole, pieces))
@@ -63,14 +65,35 @@ def test_seeds_in_a_stack_stop_and_resume_too(medium: str) -> None:
         assert a.policy_path.read_bytes() == b.policy_path.read_bytes()
 
 
-def test_a_run_alone_equals_the_same_run_in_a_stack(medium: str) -> None:
+def test_a_run_alone_equals_the_same_run_in_a_stack(medium: str, precision: str) -> None:
     """From the data to the weights: batches, noise and initial weights depend on the run's own seed alone."""
-    stack = train("bdb", medium, "stack", 200, seeds=[3, 4, 5])
+    stack = train("bdb", medium, "stack", 200, seeds=[3, 4, 5], precision=precision)
     for run in stack:
-        (alone,) = train("bdb", medium, "alone", 200, seeds=run.config()["seed"])
+        (alone,) = train("bdb", medium, "alone", 200, seeds=run.config()["seed"], precision=precision)
         ours, theirs = (load_file(r.folder / "checkpoint-000000200.safetensors") for r in (run, alone))
         for name in ours:
             assert torch.equal(ours[name], theirs[name]), name
+
+
+def test_each_precision_has_runs_of_its_own(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("offbench.devices.has_bfloat16", lambda: True)
+    one, other = (train("td3_bc", medium, "runs", 100, precision=name)[0] for name in ("float32", "bfloat16"))
+    assert other.config()["variant"] == f"{one.config()['variant']},precision=bfloat16"
+    assert one.policy_path.read_bytes() != other.policy_path.read_bytes()
+    labels = [method.label for method in read_results("runs").methods]
+    assert labels == [f"td3_bc {run.config()['variant']}" for run in (one, other)]
+
+
+def test_a_precision_that_the_device_lacks_is_refused(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("offbench.devices.has_bfloat16", lambda: False)
+    for name, reason in {
+        "bfloat16": "this processor cannot",
+        "tf32": "use float32 on a CPU",
+        "half": "'half'",
+    }.items():
+        with pytest.raises(OffbenchError, match=reason):
+            train("td3_bc", medium, "runs", 100, precision=name)
+    assert not Path("runs").exists()
 
 
 def test_new_seeds_leave_finished_ones_alone(medium: str) -> None:
@@ -240,7 +263,7 @@ def test_what_trained_a_run_later_is_noted_if_it_is_something_else(
     (run,) = train("td3_bc", medium, "runs", 100)
     train("td3_bc", medium, "runs", 200)
     assert "sessions" not in run.config()
-    elsewhere = {"device": "cuda", "tf32": True, "versions": {"torch": "9"}, "hardware": {"cores": 99}}
+    elsewhere = {"device": "cuda", "precision": "tf32", "versions": {"torch": "9"}, "hardware": {"cores": 99}}
     monkeypatch.setattr("offbench.training.made_with", lambda *_: elsewhere)
     for steps in (300, 400):
         train("td3_bc", medium, "runs", steps)

@@ -10,7 +10,7 @@ from typing import Any
 
 from offbench.cli.arguments import Parser, auto, seed_list, share, trust, whole
 
-SWITCHES = ("--tf32", "--tensorboard", "--trust")  # flags of `train` without a value: the algorithm may follow them
+SWITCHES = ("--tensorboard", "--trust")  # flags of `train` without a value: the algorithm may follow them
 
 
 def train_arguments(parser: Parser, words: list[str]) -> None:
@@ -82,7 +82,11 @@ def _machine(parser: Parser) -> None:
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
     parser.add_argument("--workers", type=whole, help="processes for training and evaluation (default: one a core)")
     parser.add_argument("--stack", type=auto, default="auto", help="most runs that train as one program (auto or N)")
-    parser.add_argument("--tf32", action="store_true", help="on a GPU: faster, less precise matrix products")
+    parser.add_argument(
+        "--precision",
+        default="float32",
+        help="of matrix products: float32, tf32 (GPUs), bfloat16 (GPUs and some processors) (default: float32)",
+    )
     parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
     trust(parser)
 

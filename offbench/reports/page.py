@@ -202,8 +202,8 @@ def _words(found: object) -> str:
 
 
 def _hardware(part: Mapping[str, Any]) -> str:
-    tf32 = ", TF32" if part.get("tf32") else ""
-    return f"{part.get('device', 'unknown device')}{tf32}; {_words(part.get('hardware'))}"
+    precision = part.get("precision", "tf32" if part.get("tf32") else "float32")
+    return f"{part.get('device', 'unknown device')}, {precision}; {_words(part.get('hardware'))}"
 
 
 def _several(texts: Sequence[str]) -> str:

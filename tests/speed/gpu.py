@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from offbench.calibrate import made_up
-from offbench.devices import arithmetic, pick_device
+from offbench.devices import PRECISIONS, arithmetic, pick_device
 from offbench.files import write_json
 from offbench.provenance import versions
 from offbench.recipes import load_recipe
@@ -50,13 +50,13 @@ def stack_of(algorithm: str, runs: int, device: str, *, captured: bool = True, *
     return stack
 
 
-def rate(algorithm: str, runs: int, device: str, *, captured: bool, tf32: bool) -> dict[str, float]:
+def rate(algorithm: str, runs: int, device: str, *, captured: bool, precision: str) -> dict[str, float]:
     """Return the sum of all runs' updates a second, and the peak memory in MB."""
     gpu = device != "cpu"
     if gpu:
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-    with arithmetic(device, tf32):
+    with arithmetic(device, precision):
         stack = stack_of(algorithm, runs, device, captured=captured)
         advance(stack, 100)
         done, began = 0, time.perf_counter()
@@ -77,7 +77,7 @@ def advance(stack: Stack, updates: int) -> int:
 
 def equality(algorithm: str, device: str) -> dict[str, float]:
     """Return the largest difference of the weights after 50 updates: captured against plain, stack against alone."""
-    with arithmetic(device, tf32=False):
+    with arithmetic(device):
         stacks = [
             stack_of(algorithm, 5, device),
             stack_of(algorithm, 5, device, captured=False),
@@ -98,11 +98,13 @@ def figures(device: str) -> dict[str, Callable[[], dict[str, float]]]:
     found: dict[str, Callable[[], dict[str, float]]] = {}
     for algorithm in ALGORITHMS:
         found[f"equality {algorithm}"] = lambda a=algorithm: equality(a, device)  # type: ignore[misc]
-        found[f"{algorithm}, 1 run, plain"] = lambda a=algorithm: rate(a, 1, device, captured=False, tf32=False)  # type: ignore[misc]
+        found[f"{algorithm}, 1 run, plain"] = lambda a=algorithm: rate(
+            a, 1, device, captured=False, precision="float32"
+        )  # type: ignore[misc]
         for runs in sizes[: 4 if algorithm == "cql" else None]:
-            for tf32 in (False, True):
-                name = f"{algorithm}, {runs} runs, captured{', TF32' if tf32 else ''}"
-                found[name] = lambda a=algorithm, r=runs, t=tf32: rate(a, r, device, captured=True, tf32=t)  # type: ignore[misc]
+            for precision in PRECISIONS:
+                name = f"{algorithm}, {runs} runs, captured, {precision}"
+                found[name] = lambda a=algorithm, r=runs, p=precision: rate(a, r, device, captured=True, precision=p)  # type: ignore[misc]
     return found
 
 

@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from offbench.provenance import has_bfloat16
 from offbench.workers import cores
 
 PEERS = Path(__file__).parent.parent.parent / ".venv-peers" / "bin" / "python"
@@ -55,6 +56,15 @@ def update_rows() -> list[Row]:
         ("cql updates vs d3rlpy", cql, peer("d3rlpy", "update", "cql"), 1.25, 1.5),
         ("cql updates vs its matrix products alone", cql, peer("jax", "products", "cql"), None, None),
     ]
+    if has_bfloat16():
+        half, cql_half = (
+            side("train", algorithm=name, hidden="256,256", precision="bfloat16") for name in ("td3_bc", "cql")
+        )
+        found += [
+            ("td3_bc updates in bfloat16 vs JAX in float32", half, peer("jax", "update", "td3_bc"), 1.15, 1.5),
+            ("td3_bc updates in bfloat16 vs float32", half, td3_bc, 1.3, 1.6),
+            ("cql updates in bfloat16 vs float32", cql_half, cql, 1.7, 2.0),
+        ]
     return [Row(*row, seconds=5.0 if "cql" in row[0] else 2.0, pinned=True) for row in found]
 
 

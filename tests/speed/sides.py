@@ -21,9 +21,11 @@ ENV = "hopper"
 ARITHMETIC = contextlib.ExitStack()  # what trainings set; left as this process ends
 
 
-def train(algorithm: str, runs: str = "1", rows: str = "100000", hidden: str = "256,256") -> Work:
+def train(
+    algorithm: str, runs: str = "1", rows: str = "100000", hidden: str = "256,256", precision: str = "float32"
+) -> Work:
     """Updates of a stack; a unit is one run's update."""
-    stack = stack_of(algorithm, int(runs), int(rows), hidden)
+    stack = stack_of(algorithm, int(runs), int(rows), hidden, precision)
     few = 5 if algorithm == "cql" else 100
 
     def work() -> int:
@@ -34,14 +36,16 @@ def train(algorithm: str, runs: str = "1", rows: str = "100000", hidden: str = "
     return work
 
 
-def stack_of(algorithm: str, runs: int = 1, rows: int = 100_000, hidden: str = "256,256") -> Stack:
+def stack_of(
+    algorithm: str, runs: int = 1, rows: int = 100_000, hidden: str = "256,256", precision: str = "float32"
+) -> Stack:
     """A stack on random transitions of hopper's shapes."""
     from offbench.devices import arithmetic
     from offbench.registry import load_algorithm
     from offbench.settings import build
     from offbench.stack import Stack
 
-    ARITHMETIC.enter_context(arithmetic("cpu", tf32=False))
+    ARITHMETIC.enter_context(arithmetic("cpu", precision))
     kind = load_algorithm(algorithm)
     config: Any = build(kind.Config, {"hidden": hidden} | ({"bc_steps": 0} if algorithm == "cql" else {}), algorithm)
     return Stack(kind, [_member(algorithm, config, rows)] * runs, "cpu")
