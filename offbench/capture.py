@@ -26,6 +26,7 @@ _UNREPEATABLE = {
     torch.Tag.data_dependent_output,  # .item()
     torch.Tag.dynamic_output_shape,  # nonzero()
 }
+_CONSTANTS = ("zeros", "ones", "full", "zeros_like", "ones_like", "full_like", "scalar_tensor")
 _ACTIVE = threading.local()
 
 
@@ -48,6 +49,7 @@ class Recording:
         self.outside: list[Tensor] = []
         self._kept: list[Any] = []  # no storage of the record is freed and used again
         self._origins: dict[int, tuple[str, int]] = {}  # of a storage's address: the call that made it, or `outside`
+        self._constants: dict[int, int] = {}  # of a storage's address: the call that fills it
 
     def replay(self) -> None:
         """Do the update once more. Call it within `torch.inference_mode()`."""
@@ -65,15 +67,31 @@ class Recording:
             )
         )
 
-    def add(self, name: Any, reads: Any, writes: Any, call: Call) -> None:
-        """Add one call; `reads` and `writes` are nested tensors and plain values."""
+    def add(self, name: Any, reads: Any, writes: Any, call: Call, *, constant: bool = False) -> None:
+        """Add one call; `reads` and `writes` are nested tensors and plain values.
+
+        Args:
+            constant: it writes the same numbers every time.
+        """
         described = tree_map_only(Tensor, self._describe, reads)
         origin = ("call", len(self.calls))
         for tensor in _tensors(writes):
             self._origins.setdefault(_address(tensor), origin)
+            if constant:
+                self._constants[_address(tensor)] = len(self.calls)
         self.key.append((name, described))
         self._kept.append((reads, writes))
         self.calls.append(call)
+
+    def changed(self, tensors: Any) -> None:
+        """Note that a call changes tensors in place: they are no constants."""
+        for tensor in _tensors(tensors):
+            self._constants.pop(_address(tensor), None)
+
+    def finish(self) -> None:
+        """Leave out of the replay what only fills constants."""
+        left_out = set(self._constants.values())
+        self.calls = [call for place, call in enumerate(self.calls) if place not in left_out]
 
     def keep(self, tensors: Any) -> None:
         """Keep tensors alive as long as this record."""
@@ -109,6 +127,7 @@ def record(update: Callable[[], Any]) -> Recording:
         _ACTIVE.recording = None
     if mode.problem:
         raise NotCapturableError(mode.problem)
+    recording.finish()
     return recording
 
 
@@ -136,13 +155,22 @@ class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
         if _UNREPEATABLE & set(func.tags):
             self.problem = self.problem or f"it calls {func}"
         elif func._schema.is_mutable:
-            self.recording.add(func, (args, kwargs), (), (func, args, kwargs))
+            self.recording.changed((args, kwargs))
+            self.recording.add(func, (args, kwargs), (), _single(func, args, kwargs))
         elif _is_view(result, (args, kwargs)) or func.overloadpacket.__name__.startswith("empty"):
             self.recording.keep(result)
         else:
             call = _in_place(func, args, kwargs, result)
-            self.recording.add(func, (args, kwargs), result, call)
+            constant = func.overloadpacket.__name__ in _CONSTANTS
+            self.recording.add(func, (args, kwargs), result, call, constant=constant)
         return result
+
+
+def _single(func: Any, args: Any, kwargs: Any) -> Call:
+    """Return the call of an operation in place; that of a list of one tensor (Adam's step count) as the tensor's."""
+    if func is torch.ops.aten._foreach_add_.Scalar and len(args[0]) == 1:
+        return args[0][0].add_, (args[1],), kwargs
+    return func, args, kwargs
 
 
 def _tensors(nested: Any) -> list[Tensor]:
