@@ -34,7 +34,7 @@ from offbench.ladder import read_ladder
 from offbench.planning import prepare
 from offbench.policy import Policy, load_policy
 from offbench.provenance import warn_other_physics
-from offbench.recipes import read_recipe, shipped
+from offbench.recipes import load_recipe, read_recipe, shipped
 from offbench.runs import Run
 from offbench.tables import render, score_runs
 from offbench.transitions import Transitions
@@ -101,7 +101,7 @@ def metadata(folder: Path, data: bytes) -> object:
     found = dataset.read_metadata("fuzzed-v0")
     empty: dict[str, Any] = dict.fromkeys(Transitions.__dataclass_fields__)
     flat = Transitions(**empty | {"dataset_id": "fuzzed-v0", "metadata": found})
-    warn_other_physics("fuzzed-v0", dataset.provenance(found).get("versions", {}))
+    warn_other_physics("fuzzed-v0", dataset.provenance(found).get("versions", {}), load_recipe("hopper").env_spec())
     summary = Summary("fuzzed-v0", found, np.arange(4.0), np.arange(1, 5), 0.5)
     return flat.env_id, flat.references, summary.lines()
 
