@@ -15,9 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from offbench.algorithm import Batch, Draw, PolicyParts
-from offbench.networks import Network
-from offbench.settings import setting
+from offbench.algorithm import Batch, Draw, Network, PolicyParts, setting
 
 
 @dataclass(frozen=True)

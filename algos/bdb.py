@@ -27,9 +27,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from offbench.algorithm import Batch, Draw, PolicyParts
-from offbench.networks import Learned, Network, Target
-from offbench.settings import setting
+from offbench.algorithm import Batch, Draw, Learned, Network, PolicyParts, Target, setting
 
 ADAPTIVE, LEARNED = -1.0, -2.0  # what stack_configs makes of beta's words
 

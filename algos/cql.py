@@ -28,9 +28,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from offbench.algorithm import Batch, Draw, PolicyParts
-from offbench.networks import Learned, Network, Target
-from offbench.settings import setting
+from offbench.algorithm import Batch, Draw, Learned, Network, PolicyParts, Target, setting
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 ATANH_CLIP = 0.999  # data actions at the bounds have no inverse tanh

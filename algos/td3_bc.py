@@ -20,9 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from offbench.algorithm import Batch, Draw, PolicyParts
-from offbench.networks import Network, Target
-from offbench.settings import setting
+from offbench.algorithm import Batch, Draw, Network, PolicyParts, Target, setting
 
 
 @dataclass(frozen=True)

@@ -17,27 +17,28 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from offbench.errors import OffbenchError
+from offbench.common.errors import OffbenchError
 
 if TYPE_CHECKING:
-    from offbench.agents import behaviour
-    from offbench.assess import evaluate
-    from offbench.benchmarking import benchmark
-    from offbench.cards import card
-    from offbench.comparison import compare
-    from offbench.d4rl import import_d4rl
-    from offbench.deploy import export_policy
-    from offbench.describe import inventory, show
-    from offbench.diagnosis import doctor
-    from offbench.exports import export
-    from offbench.filming import video
-    from offbench.launch import train
-    from offbench.record import collect
-    from offbench.recorded_env import make_env
-    from offbench.reports import report
-    from offbench.tables import normalize_runs_or_returns as normalize
-    from offbench.transitions import load
-    from offbench.verification import verify
+    from offbench.agents.behaviour import behaviour
+    from offbench.analysis.compare import compare
+    from offbench.analysis.normalize import normalize_runs_or_returns as normalize
+    from offbench.benchmarks.benchmark import benchmark
+    from offbench.data.card import card
+    from offbench.data.collect import collect
+    from offbench.data.export import export
+    from offbench.data.import_d4rl import import_d4rl
+    from offbench.data.recorded_env import make_env
+    from offbench.data.show import show
+    from offbench.data.transitions import load
+    from offbench.evaluation.evaluate import evaluate
+    from offbench.evaluation.export_policy import export_policy
+    from offbench.evaluation.video import video
+    from offbench.reports.report import report
+    from offbench.tools.doctor import doctor
+    from offbench.tools.inventory import inventory
+    from offbench.training.train import train
+    from offbench.verification.verify import verify
 
 __all__ = [
     "OffbenchError",
@@ -64,25 +65,25 @@ __all__ = [
 
 # Loaded when first used: `offbench list` must not wait for PyTorch.
 _VERBS = {
-    "behaviour": ("offbench.agents", "behaviour"),
-    "benchmark": ("offbench.benchmarking", "benchmark"),
-    "card": ("offbench.cards", "card"),
-    "collect": ("offbench.record", "collect"),
-    "compare": ("offbench.comparison", "compare"),
-    "doctor": ("offbench.diagnosis", "doctor"),
-    "evaluate": ("offbench.assess", "evaluate"),
-    "export": ("offbench.exports", "export"),
-    "export_policy": ("offbench.deploy", "export_policy"),
-    "import_d4rl": ("offbench.d4rl", "import_d4rl"),
-    "inventory": ("offbench.describe", "inventory"),
-    "load": ("offbench.transitions", "load"),
-    "make_env": ("offbench.recorded_env", "make_env"),
-    "normalize": ("offbench.tables", "normalize_runs_or_returns"),
-    "report": ("offbench.reports", "report"),
-    "show": ("offbench.describe", "show"),
-    "train": ("offbench.launch", "train"),
-    "verify": ("offbench.verification", "verify"),
-    "video": ("offbench.filming", "video"),
+    "behaviour": ("offbench.agents.behaviour", "behaviour"),
+    "benchmark": ("offbench.benchmarks.benchmark", "benchmark"),
+    "card": ("offbench.data.card", "card"),
+    "collect": ("offbench.data.collect", "collect"),
+    "compare": ("offbench.analysis.compare", "compare"),
+    "doctor": ("offbench.tools.doctor", "doctor"),
+    "evaluate": ("offbench.evaluation.evaluate", "evaluate"),
+    "export": ("offbench.data.export", "export"),
+    "export_policy": ("offbench.evaluation.export_policy", "export_policy"),
+    "import_d4rl": ("offbench.data.import_d4rl", "import_d4rl"),
+    "inventory": ("offbench.tools.inventory", "inventory"),
+    "load": ("offbench.data.transitions", "load"),
+    "make_env": ("offbench.data.recorded_env", "make_env"),
+    "normalize": ("offbench.analysis.normalize", "normalize_runs_or_returns"),
+    "report": ("offbench.reports.report", "report"),
+    "show": ("offbench.data.show", "show"),
+    "train": ("offbench.training.train", "train"),
+    "verify": ("offbench.verification.verify", "verify"),
+    "video": ("offbench.evaluation.video", "video"),
 }
 
 

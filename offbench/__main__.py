@@ -1,6 +1,6 @@
 """`python -m offbench` is `offbench`."""
 
-from offbench.cli import main
+from offbench.cli.main import main
 
 if __name__ == "__main__":
     main()

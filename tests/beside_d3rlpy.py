@@ -58,7 +58,7 @@ def learn(data: str, seed: str, folder: str, steps: str = str(STEPS), every: str
 def play(path: Path, env_id: str = ENV_ID) -> tuple[float, float]:
     """Return mean return and mean length of what has been handed over; it must act here as it did there."""
     from offbench import evaluate
-    from offbench.policy import Policy
+    from offbench.rollouts.policy import Policy
 
     found = np.load(path, allow_pickle=False)
     layers = tuple((found[f"w{i}"], found[f"b{i}"]) for i in range(3))
@@ -73,7 +73,7 @@ def play(path: Path, env_id: str = ENV_ID) -> tuple[float, float]:
 
 def ours(runs: str) -> list[list[tuple[float, float]]]:
     """Return (mean return, mean length) of each evaluation of each of our runs."""
-    from offbench.results import read_results
+    from offbench.analysis.results import read_results
 
     entries = read_results(runs).entries.items()
     found = [entry for (task, method), entry in entries if (task.dataset, method.label) == (DATASET, "td3_bc")]
@@ -108,7 +108,7 @@ def theirs() -> list[list[tuple[float, float]]]:
 
 def main() -> None:
     """Write the table."""
-    from offbench.tables import markdown
+    from offbench.common.tables import markdown
 
     parser = argparse.ArgumentParser(prog="python -m tests.beside_d3rlpy", description=__doc__)
     parser.add_argument("--runs", default="runs", help="where `offbench benchmark baselines` has put its runs")

@@ -45,14 +45,14 @@ rungs = 4
 @pytest.fixture(params=["float32", "bfloat16"])
 def precision(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Each precision of a CPU; PyTorch emulates bfloat16, slowly, where users are refused it."""
-    monkeypatch.setattr("offbench.devices.has_bfloat16", lambda: True)
+    monkeypatch.setattr("offbench.training.devices.has_bfloat16", lambda: True)
     return str(request.param)
 
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     """A recipe file and a behaviour folder in which its agent is trained already."""
-    from offbench.agents import behaviour
+    from offbench.agents.behaviour import behaviour
 
     folder = tmp_path_factory.mktemp("tiny")
     recipe = folder / "tiny.toml"

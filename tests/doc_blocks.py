@@ -32,7 +32,7 @@ LANGUAGES = ("sh", "python", "toml", "text", "bibtex", "slurm")
 REASONS = (
     "CI itself runs it",
     "tests/test_packaging.py installs the wheel",
-    "tests/test_interop.py runs this page",
+    "tests/data/test_interop.py runs this page",
     "needs a Slurm cluster",
     "needs a Ray cluster",
     "needs a GPU",

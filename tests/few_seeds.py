@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from offbench.comparison import favoured
-from offbench.statistics import iqm, paired
-from offbench.tables import markdown
+from offbench.analysis.compare import favoured
+from offbench.analysis.statistics import iqm, paired
+from offbench.common.tables import markdown
 
 SIZES = ((1, 3), (1, 5), (1, 10), (3, 3), (3, 5), (15, 3), (15, 5))  # tasks, seeds
 SIMULATIONS = 600

@@ -9,8 +9,8 @@ import shutil
 import sys
 from pathlib import Path
 
-from offbench.runs import find_runs
-from offbench.stacking import finished
+from offbench.training.grouping import finished
+from offbench.training.run import find_runs
 
 FILES = ("config.json", "evaluations.csv", "losses.csv")
 

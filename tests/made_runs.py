@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from offbench.files import write_json
-from offbench.runs import Run, run_folder
+from offbench.common.files import write_json
+from offbench.training.run import Run, run_folder
 
 COMMAND = "offbench train {algorithm} --dataset {dataset} --seeds 0:{seeds} --steps {steps}"
 

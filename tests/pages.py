@@ -7,7 +7,7 @@ import json
 from html.parser import HTMLParser
 from pathlib import Path
 
-from offbench.files import write_json
+from offbench.common.files import write_json
 from tests.made_runs import made_run
 
 

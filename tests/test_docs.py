@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from offbench.algorithm import Algorithm, Batch, PolicyParts
-from offbench.policy import ACTIVATIONS, KINDS
+from offbench.algorithm.interface import Algorithm, Batch, PolicyParts
+from offbench.rollouts.policy import ACTIVATIONS, KINDS
 from tests.doc_blocks import (
     DOCS,
     LANGUAGES,
@@ -155,4 +155,4 @@ def test_the_site_builds_strictly(tmp_path: Path) -> None:
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "Hopper-v5 at three levels" in (tmp_path / "site" / "index.html").read_text()
-    assert 'id="offbench.record.collect"' in (tmp_path / "site" / "api.html").read_text()
+    assert 'id="offbench.data.collect.collect"' in (tmp_path / "site" / "api.html").read_text()

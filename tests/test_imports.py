@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -37,6 +38,52 @@ def test_no_algorithm_imports_another(path: Path) -> None:
     assert not {name for name in imported(path) if name.startswith(("offbench.algos", "algos"))}
 
 
+# Top to bottom. A package imports only from those after it.
+PACKAGES = [
+    "cli",
+    "reports",
+    "tools",
+    "evaluation",
+    "benchmarks",
+    "analysis",
+    "training",
+    "verification",
+    "data",
+    "agents",
+    "rollouts",
+    "algorithm",
+    "envs",
+    "common",
+]
+
+
+@pytest.mark.parametrize("path", TOOLKIT, ids=lambda p: str(p.relative_to(ROOT)))
+def test_packages_import_only_from_those_below(path: Path) -> None:
+    package = path.relative_to(ROOT / "offbench").parts[0]
+    if package in ("__init__.py", "__main__.py"):  # they name the public functions and the command line
+        return
+    imports = {name.split(".")[1] for name in imported(path) if name.startswith("offbench.")} & set(PACKAGES)
+    assert not [name for name in imports if PACKAGES.index(name) < PACKAGES.index(package)]
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in TOOLKIT}
+    order = graphlib.TopologicalSorter({name: imported(path) & names.keys() for name, path in names.items()})
+    order.prepare()  # raises CycleError
+
+
+def test_nothing_but_packages_lies_in_offbench() -> None:
+    folder = ROOT / "offbench"
+    assert {path.name for path in folder.iterdir() if path.is_file()} == {"__init__.py", "__main__.py", "py.typed"}
+    assert {path.parts[len(folder.parts)] for path in TOOLKIT if path.parent != folder} == set(PACKAGES)
+
+
+def test_an_algorithm_imports_offbench_algorithm_alone() -> None:
+    for path in (ROOT / "algos").glob("*.py"):
+        found = {node.module for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)}
+        assert {name for name in found if name and name.startswith("offbench")} <= {"offbench.algorithm"}
+
+
 def test_datasets_hold_no_code() -> None:
     assert not list((ROOT / "datasets").rglob("*.py"))
 
@@ -51,7 +98,7 @@ def test_no_module_is_longer_than_400_lines() -> None:
 def test_light_commands_do_not_load_pytorch(words: list[str], home: Path) -> None:
     code = f"""
 import sys
-from offbench.cli import main
+from offbench.cli.main import main
 try:
     main({words!r})
 except SystemExit as done:
@@ -67,14 +114,14 @@ def test_rollout_workers_load_neither_pytorch_nor_the_users_script(home: Path) -
         """
 print("script runs")
 import numpy as np
-from offbench.environments import env_spec
-from offbench.policy import uniform
-from offbench.rollout import Rollouts
+from offbench.envs.environments import env_spec
+from offbench.rollouts.policy import uniform
+from offbench.rollouts.rollouts import Rollouts
 
 with Rollouts(env_spec("InvertedPendulum-v5"), workers=1) as rollouts:
     policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     print(len(rollouts.outcomes(policy, 0, (), 3, True).result()), "episodes")
-    from offbench.workers import loaded
+    from offbench.common.processes import loaded
     print("worker has", rollouts._pool.submit(loaded, ("torch", "stable_baselines3")).result())
 """
     )

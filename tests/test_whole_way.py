@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import offbench
-from offbench.levels import LEVELS
-from offbench.registry import algorithm_names
+from offbench.data.levels import LEVELS
+from offbench.training.registry import algorithm_names
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]
 

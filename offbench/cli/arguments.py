@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any, NoReturn
 
-from offbench.errors import OffbenchError, nearest
+from offbench.common.errors import OffbenchError, nearest
 
 
 class Parser(argparse.ArgumentParser):

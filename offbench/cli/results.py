@@ -11,7 +11,7 @@ from offbench.cli.arguments import Parser, natural, number, trust, whole
 
 def normalize_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `normalize`."""
-    from offbench.tables import FORMATS
+    from offbench.analysis.normalize import FORMATS
 
     parser.add_argument("returns", nargs="*", type=number, metavar="RETURN", help="returns to score, with --env")
     parser.add_argument("--env", help="the environment of the returns: a recipe")
@@ -20,8 +20,8 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--plot", metavar="PICTURE", help="also draw the learning curves (.png, .svg, .pdf)")
 
     def run(style: str, plot: str | None, **arguments: Any) -> None:
-        from offbench.tables import count_waiting, normalize_runs_or_returns, render
-        from offbench.wording import counted
+        from offbench.analysis.normalize import count_waiting, normalize_runs_or_returns, render
+        from offbench.common.text import counted
 
         rows = normalize_runs_or_returns(**arguments)
         print(render(rows, style))
@@ -30,7 +30,7 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
             verb = "has" if waiting == 1 else "have"
             print(f"{counted(waiting, 'run')} {verb} no evaluation yet", file=sys.stderr)
         if plot:
-            from offbench.plots import plot_curves
+            from offbench.reports.curves import plot_curves
 
             print(f"curves in {plot_curves(arguments['runs'], plot)}", file=sys.stderr)
 
@@ -43,7 +43,7 @@ def report_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--out", default="report", metavar="DIR", help="where the report goes (default: report)")
 
     def run(**arguments: Any) -> None:
-        from offbench.reports import report
+        from offbench.reports.report import report
 
         print(f"report in {report(**arguments)}")
 
@@ -58,7 +58,7 @@ def compare_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(json: bool, **arguments: Any) -> None:
-        from offbench.comparison import compare
+        from offbench.analysis.compare import compare
 
         found = compare(**arguments)
         print(dumps(found.row(), indent=1) if json else "\n".join(found.lines()))
@@ -80,7 +80,7 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     trust(parser)
 
     def similar(path: str, tolerance: float, action_tolerance: float, seed: int) -> None:
-        from offbench.assess import similarity
+        from offbench.evaluation.evaluate import similarity
 
         found = similarity(path, tolerance=tolerance, action_tolerance=action_tolerance, seed=seed)
         print(f"{path}: similar score at step {found['step']:,} over {found['samples']:,} transitions")
@@ -88,7 +88,7 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
         print(f"by action  {found['action_similar']:.2f}%  (root mean square distance at most {action_tolerance:g})")
 
     def run(paths: list[str], similarity: bool, tolerance: float, action_tolerance: float, **arguments: Any) -> None:
-        from offbench.assess import evaluate
+        from offbench.evaluation.evaluate import evaluate
 
         for path in paths:
             if similarity:

@@ -15,8 +15,8 @@ SWITCHES = ("--tensorboard", "--trust")  # flags of `train` without a value: the
 
 def train_arguments(parser: Parser, words: list[str]) -> None:
     """Add the arguments of `train`."""
-    from offbench.registry import algorithm_names, load_algorithm
-    from offbench.settings import fields
+    from offbench.common.settings import fields
+    from offbench.training.registry import algorithm_names, load_algorithm
 
     parser.add_argument("algorithm", metavar="ALGO", help=f"one of {', '.join(algorithm_names())}")
     parser.add_argument("--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets")
@@ -52,8 +52,8 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         )
 
     def run(**arguments: Any) -> None:
-        from offbench.launch import train
-        from offbench.runs import Run
+        from offbench.training.run import Run
+        from offbench.training.train import train
 
         settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
         rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
@@ -93,7 +93,7 @@ def _machine(parser: Parser) -> None:
 
 def benchmark_arguments(parser: Parser, words: list[str]) -> None:
     """Add the arguments of `benchmark`."""
-    from offbench.grid import shipped_grids
+    from offbench.benchmarks.grid import shipped_grids
 
     parser.add_argument("grid", metavar="GRID", help=f"{', '.join(shipped_grids())}, or a grid file")
     parser.add_argument("--plan", action="store_true", help="print runs, cost and disk, and do nothing")
@@ -113,23 +113,24 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
         address: str | None,
         **arguments: Any,
     ) -> None:
-        from offbench import planning, tables
-        from offbench.benchmarking import benchmark
+        from offbench.analysis import normalize
+        from offbench.benchmarks.benchmark import benchmark
+        from offbench.benchmarks.plan import Plan, prepare
 
         if plan:
-            print("\n".join(planning.Plan(planning.prepare(**arguments))))
+            print("\n".join(Plan(prepare(**arguments))))
             return
         command = shlex.join(["offbench", "benchmark", *words])
         where = None
         if executor == "ray":
-            from offbench.cluster import RayExecutor
+            from offbench.benchmarks.ray_executor import RayExecutor
 
             where = RayExecutor(address)
             arguments["workers"] = arguments["workers"] or where.cpus
-        bench = planning.prepare(**arguments)
+        bench = prepare(**arguments)
         finished = benchmark(bench, budget=budget, shard=shard, executor=where, command=command)
-        if rows := tables.score_some(bench.begun()):  # a small budget ends before there are any
-            print(tables.render(rows))
+        if rows := normalize.score_some(bench.begun()):  # a small budget ends before there are any
+            print(normalize.render(rows))
         if not finished:
             print("stopped at the budget; the same command goes on", file=sys.stderr)
 

@@ -9,14 +9,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from offbench import dataset, transitions
-from offbench.errors import OffbenchError
-from offbench.files import read_json
-from offbench.reports.layout import Cell, Table
+from offbench.analysis.results import Results, Task, Trained
+from offbench.common.errors import OffbenchError
+from offbench.common.files import read_json
+from offbench.common.tables import Cell, Table
+from offbench.data import minari_store, transitions
 from offbench.reports.markup import Markup, join, tag
 from offbench.reports.page import table
 from offbench.reports.tables import NONE
-from offbench.results import Results, Task, Trained
 
 SHOWN = 12  # digits of a content hash, in the cards as here
 
@@ -54,7 +54,7 @@ def _scale(trained: Trained) -> str:
 def _sizes(task: Task) -> list[Cell]:
     """Return transitions, episodes and mean return of a dataset if it is here with the same content."""
     try:
-        recorded = dataset.provenance(dataset.read_metadata(task.dataset)).get("content_sha256")
+        recorded = minari_store.provenance(minari_store.read_metadata(task.dataset)).get("content_sha256")
         if recorded not in (None, task.content):
             return [NONE] * 3  # recorded again since: not worth a conversion
         data = transitions.load(task.dataset)

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from offbench.results import REFERENCES, Entry, Method, Results, Task
-from offbench.statistics import Estimate, Scores, curve, iqm, profile
+from offbench.analysis.results import REFERENCES, Entry, Method, Results, Task
+from offbench.analysis.statistics import Estimate, Scores, curve, iqm, profile
 
 INK = "#21252b"  # text and axes; the page replaces it by its own text colour
 GRID = "#8b93a0"
@@ -243,7 +243,7 @@ def _draw(
     import matplotlib as mpl
     from matplotlib.lines import Line2D
 
-    from offbench.plots import figure
+    from offbench.common.plotting import figure
 
     # names may hold $ and are not formulas; ids in the SVG must be the same on every run
     style: Any = {"text.parse_math": False, "svg.fonttype": "none", "svg.hashsalt": name, "axes.labelcolor": INK}

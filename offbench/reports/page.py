@@ -9,13 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from offbench.analysis.results import REFERENCES, Entry, Results
+from offbench.common.scores import run_return
+from offbench.common.tables import Cell, Table
 from offbench.reports.figures import Figure, Line
-from offbench.reports.layout import Cell, Table
 from offbench.reports.markup import Markup, breakable, join, prose, tag
 from offbench.reports.tables import cell_id
-from offbench.results import REFERENCES, Entry, Results
-from offbench.runs import Run, sessions
-from offbench.scores import run_return
+from offbench.training.run import Run, sessions
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from offbench.errors import OffbenchError
-from offbench.files import read_json
-from offbench.reports.layout import Cell, Table
+from offbench.analysis.results import Entry, Method, Results
+from offbench.common.errors import OffbenchError
+from offbench.common.files import read_json
+from offbench.common.scores import mean_std
+from offbench.common.tables import Cell, Table
 from offbench.reports.tables import NONE, plus_minus, published, row_name
-from offbench.results import Entry, Method, Results
-from offbench.scores import mean_std
 
 
 def similarity_tables(results: Results) -> list[Table]:

@@ -8,13 +8,13 @@ import importlib.resources
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from offbench.comparison import comparable, differences, favoured, partners
-from offbench.reports.layout import Cell, Table
-from offbench.results import REFERENCES, Entry, Method, Results, Task, window_words
-from offbench.runs import DIGITS
-from offbench.scores import LAST, mean_std
-from offbench.statistics import Estimate, Scores, improvement, iqm, paired
-from offbench.wording import counted
+from offbench.analysis.compare import comparable, differences, favoured, partners
+from offbench.analysis.results import REFERENCES, Entry, Method, Results, Task, window_words
+from offbench.analysis.statistics import Estimate, Scores, improvement, iqm, paired
+from offbench.common.scores import LAST, mean_std
+from offbench.common.tables import Cell, Table
+from offbench.common.text import counted
+from offbench.training.run import DIGITS
 
 PAPER = "BDB paper, Table 1"
 NONE = Cell("-")

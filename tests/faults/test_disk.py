@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 
 import offbench
-from offbench import dataset
-from offbench.cli import main
-from offbench.exports import export
-from offbench.runs import Run
+from offbench.cli.main import main
+from offbench.data import minari_store
+from offbench.data.export import export
+from offbench.training.run import Run
+from tests.cli.test_bad_input import refusal
 from tests.faults.test_kill import facts, whole
-from tests.test_bad_input import refusal
 
 SMALL = ["--steps", "40", "--eval-every", "20", "--eval-episodes", "1", "--hidden", "8,8", "--batch-size", "8"]
 
@@ -39,7 +39,7 @@ def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]
 @pytest.fixture
 def no_look_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let recording begin although it will not fit, as when another program fills the disk meanwhile."""
-    monkeypatch.setattr(dataset.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10**12})())
+    monkeypatch.setattr(minari_store.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10**12})())
 
 
 def state(folder: Path) -> dict[str, bytes]:
@@ -59,11 +59,11 @@ def test_a_full_disk_while_recording(
     right = whole("tiny-medium-v0")
     line = refusal([*words, "--steps", "20000", "--overwrite"], capsys)
     assert "No space left on device" in line
-    assert dataset.local_ids() == ["tiny-medium-v0"]
+    assert minari_store.local_ids() == ["tiny-medium-v0"]
     assert whole("tiny-medium-v0") == right
     assert [p.name for p in small_disk.iterdir() if not p.name.endswith(".lock")] == ["tiny-medium-v0"]
     main([*words, "--steps", "120", "--overwrite"])
-    assert dataset.read_metadata("tiny-medium-v0")["total_steps"] == 120
+    assert minari_store.read_metadata("tiny-medium-v0")["total_steps"] == 120
 
 
 def test_a_full_disk_while_training(
@@ -72,7 +72,7 @@ def test_a_full_disk_while_training(
     """The last checkpoint stays, and the same command goes on once there is room."""
     words = ["train", "td3_bc", "--dataset", medium, *SMALL, "--workers", "1"]
     main([*words, "--runs", str(home / "undisturbed")])
-    (run,) = offbench.runs.find_runs(home / "undisturbed")
+    (run,) = offbench.training.run.find_runs(home / "undisturbed")
     runs = small_disk / "runs"
     main(
         [
@@ -98,7 +98,7 @@ def test_a_full_disk_while_training(
     }
     filler.unlink()
     main([*words, "--runs", str(runs)])
-    (again,) = offbench.runs.find_runs(runs)
+    (again,) = offbench.training.run.find_runs(runs)
     for name in ("evaluations.csv", "policy.safetensors", "checkpoint-000000040.safetensors"):
         assert (again.folder / name).read_bytes() == (run.folder / name).read_bytes()
 
@@ -110,7 +110,7 @@ def test_a_read_only_disk(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    shutil.copytree(dataset.path_of(medium), small_disk / medium)
+    shutil.copytree(minari_store.path_of(medium), small_disk / medium)
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     cache = os.environ["OFFBENCH_CACHE"]
     for words in (
@@ -174,7 +174,7 @@ def test_a_file_that_cannot_grow(
     assert (whole(name), facts(name)) == (right, known)
     assert {path.read_text() for path in home.glob("out.*")} == {"old"}
     assert not list(home.glob(".out*"))
-    assert [p.name for p in dataset.root().iterdir() if not p.name.endswith(".lock")] == [name]
+    assert [p.name for p in minari_store.root().iterdir() if not p.name.endswith(".lock")] == [name]
 
 
 def test_every_write_in_turn(medium: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,7 +182,7 @@ def test_every_write_in_turn(medium: str, home: Path, monkeypatch: pytest.Monkey
     words = ["train", "td3_bc", "--dataset", medium, *SMALL, "--workers", "1"]
     offbench.load(medium)
     main([*words, "--runs", "undisturbed"])
-    (right,) = offbench.runs.find_runs(home / "undisturbed")
+    (right,) = offbench.training.run.find_runs(home / "undisturbed")
     names = ("evaluations.csv", "losses.csv", "policy.safetensors", "checkpoint-000000040.safetensors")
     wanted = {name: (right.folder / name).read_bytes() for name in names}
     real, count, failing = os.replace, [0], [0]
@@ -193,7 +193,7 @@ def test_every_write_in_turn(medium: str, home: Path, monkeypatch: pytest.Monkey
             raise OSError(28, "No space left on device")
         real(*arguments, **options)
 
-    monkeypatch.setattr("offbench.files.os.replace", replace)
+    monkeypatch.setattr("offbench.common.files.os.replace", replace)
     refused = 0
     for failing[0] in range(1, 100):
         count[0] = 0
@@ -204,11 +204,11 @@ def test_every_write_in_turn(medium: str, home: Path, monkeypatch: pytest.Monkey
         except SystemExit as stopped:
             refused += stopped.code == 2
         failing_now, failing[0] = failing[0], 0
-        for run in offbench.runs.find_runs(home / runs):
+        for run in offbench.training.run.find_runs(home / runs):
             sound(run)
         main([*words, "--runs", runs])
         failing[0] = failing_now
-        (run,) = offbench.runs.find_runs(home / runs)
+        (run,) = offbench.training.run.find_runs(home / runs)
         assert {name: (run.folder / name).read_bytes() for name in names} == wanted
     assert refused >= 8  # config, and at each of two checkpoints evaluations, losses, policy and the checkpoint
 
@@ -227,15 +227,15 @@ def test_an_id_that_is_a_link_does_not_lead_out(
     outside = home / "outside"
     (outside / "data").mkdir(parents=True)
     (outside / "data" / "thesis.tex").write_text("years of work")
-    dataset.root().mkdir(parents=True)
-    (dataset.root() / "tiny-medium-v0").symlink_to(outside)
-    (dataset.root() / "space").symlink_to(outside)
+    minari_store.root().mkdir(parents=True)
+    (minari_store.root() / "tiny-medium-v0").symlink_to(outside)
+    (minari_store.root() / "space").symlink_to(outside)
     words = ["collect", tiny[0], "--behaviour-dir", tiny[1], "--workers", "1", "--steps", "100"]
     assert "leads out of" in refusal([*words, "--id", "space/x-v0"], capsys)
     main([*words, "--overwrite"])
-    assert not (dataset.root() / "tiny-medium-v0").is_symlink()
+    assert not (minari_store.root() / "tiny-medium-v0").is_symlink()
     assert state(outside) == {"data/thesis.tex": b"years of work"}
-    assert [p.name for p in dataset.root().iterdir() if not p.name.endswith(".lock")] == [
+    assert [p.name for p in minari_store.root().iterdir() if not p.name.endswith(".lock")] == [
         "tiny-medium-v0",
         "space",
-    ] or {p.name for p in dataset.root().iterdir() if not p.name.endswith(".lock")} == {"tiny-medium-v0", "space"}
+    ] or {p.name for p in minari_store.root().iterdir() if not p.name.endswith(".lock")} == {"tiny-medium-v0", "space"}

@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 
 import offbench
-from offbench import files, stamps, transitions
-from offbench.policy import uniform
+from offbench.common import files
+from offbench.data import file_stamps, transitions
+from offbench.rollouts.policy import uniform
 
 REWARDS = "episode_0/rewards"
 
@@ -126,7 +127,7 @@ def test_a_copied_cache_is_hashed_once_and_believed(
     (home / "cache").rename(home / "old")
     shutil.copytree(home / "old", home / "cache")
     hashed: list[Path] = []
-    monkeypatch.setattr(stamps, "sha256_of", lambda path: hashed.append(path) or files.sha256_of(path))
+    monkeypatch.setattr(file_stamps, "sha256_of", lambda path: hashed.append(path) or files.sha256_of(path))
     monkeypatch.setattr(transitions, "_convert", None)
     transitions.load(recorded)
     assert len(hashed) == len(transitions.ARRAYS)

@@ -26,20 +26,21 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from offbench import checkpoints, dataset
-from offbench.d4rl import import_d4rl
-from offbench.describe import Summary
-from offbench.errors import OffbenchError
-from offbench.ladder import read_ladder
-from offbench.planning import prepare
-from offbench.policy import Policy, load_policy
-from offbench.provenance import warn_other_physics
-from offbench.recipes import load_recipe, read_recipe, shipped
-from offbench.runs import Run
-from offbench.tables import render, score_runs
-from offbench.transitions import Transitions
+from offbench.agents.ladder import read_ladder
+from offbench.analysis.normalize import render, score_runs
+from offbench.benchmarks.plan import prepare
+from offbench.common import checkpoints
+from offbench.common.errors import OffbenchError
+from offbench.data import minari_store
+from offbench.data.import_d4rl import import_d4rl
+from offbench.data.show import Summary
+from offbench.data.transitions import Transitions
+from offbench.envs.recipes import load_recipe, read_recipe, shipped
+from offbench.envs.same_physics import warn_other_physics
+from offbench.rollouts.policy import Policy, load_policy
+from offbench.training.run import Run
+from tests.data.test_import_and_export import d4rl_file
 from tests.faults.spoil import WOUNDS, spoiled_json, spoiled_tensors, spoiled_words, wounded
-from tests.test_data_travels import d4rl_file
 
 NEW = int(os.environ.get("OFFBENCH_FUZZ", "0"))
 CASES = NEW or 12_500  # of each of the readers below, in the slow run
@@ -95,13 +96,15 @@ def checkpoint(folder: Path, data: bytes) -> object:
 
 
 def metadata(folder: Path, data: bytes) -> object:
-    path = dataset.root() / "fuzzed-v0" / "data" / "metadata.json"
+    path = minari_store.root() / "fuzzed-v0" / "data" / "metadata.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
-    found = dataset.read_metadata("fuzzed-v0")
+    found = minari_store.read_metadata("fuzzed-v0")
     empty: dict[str, Any] = dict.fromkeys(Transitions.__dataclass_fields__)
     flat = Transitions(**empty | {"dataset_id": "fuzzed-v0", "metadata": found})
-    warn_other_physics("fuzzed-v0", dataset.provenance(found).get("versions", {}), load_recipe("hopper").env_spec())
+    warn_other_physics(
+        "fuzzed-v0", minari_store.provenance(found).get("versions", {}), load_recipe("hopper").env_spec()
+    )
     summary = Summary("fuzzed-v0", found, np.arange(4.0), np.arange(1, 5), 0.5)
     return flat.env_id, flat.references, summary.lines()
 

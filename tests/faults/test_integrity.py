@@ -14,13 +14,16 @@ from pathlib import Path
 
 import pytest
 
-from offbench import collect, files, registry, tables
-from offbench.cli import main
-from offbench.errors import OffbenchError
-from offbench.runs import Run, find_runs, variant
-from offbench.settings import setting
-from offbench.wording import no_formula, printable
-from tests.test_bad_input import refusal
+from offbench import collect
+from offbench.analysis import normalize
+from offbench.cli.main import main
+from offbench.common import files
+from offbench.common.errors import OffbenchError
+from offbench.common.settings import setting
+from offbench.common.text import no_formula, printable
+from offbench.training import registry
+from offbench.training.run import Run, find_runs, variant
+from tests.cli.test_bad_input import refusal
 
 ROWS = "step,episode,return,length\n100,0,1.0,5\n100,1,2.0,5\n200,0,3.0,5\n200,1,4.0,5\n"
 
@@ -99,7 +102,7 @@ def test_rows_that_do_not_fit_their_key_are_damage(
     trained(tmp_path / "seed-1", rows)
     assert names in refusal(["normalize", "--runs", str(tmp_path)], capsys)
     trained(tmp_path / "seed-0")
-    (row,) = tables.score_runs(tmp_path)
+    (row,) = normalize.score_runs(tmp_path)
     assert row["seeds"] == 1
     assert row["score"] == pytest.approx(25.0)  # mean of 1, 2, 3, 4 between 0 and 10
     said = capsys.readouterr().err
@@ -119,7 +122,7 @@ def test_a_run_with_an_unreadable_config_is_named(tmp_path: Path, capsys: pytest
     trained(tmp_path / "seed-0")
     (trained(tmp_path / "seed-1").folder / "config.json").write_text("{")
     assert len(find_runs(tmp_path)) == 2
-    assert tables.score_runs(tmp_path)[0]["seeds"] == 1
+    assert normalize.score_runs(tmp_path)[0]["seeds"] == 1
     assert "seed-1/config.json" in capsys.readouterr().err
 
 
@@ -150,7 +153,7 @@ def test_escape_sequences_are_shown_not_obeyed(tmp_path: Path, capsys: pytest.Ca
 
 @pytest.mark.parametrize("cell", ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\t=1"])
 def test_no_cell_is_a_formula(cell: str) -> None:
-    text = tables.render([{"dataset": cell, "return": -1.5}], "csv")
+    text = normalize.render([{"dataset": cell, "return": -1.5}], "csv")
     header, row = csv.reader(io.StringIO(text))
     assert (header, row) == (["dataset", "return"], ["'" + cell, "-1.5"])
     assert no_formula("-1.5") == "-1.5"
@@ -223,7 +226,7 @@ def test_whatever_a_command_raises_is_one_line(
     def fail() -> None:
         raise error
 
-    monkeypatch.setattr("offbench.describe.inventory_lines", fail)
+    monkeypatch.setattr("offbench.data.show.inventory_lines", fail)
     assert names in refusal(["list"], capsys)
     monkeypatch.setenv("OFFBENCH_TRACEBACK", "1")
     with pytest.raises(SystemExit):

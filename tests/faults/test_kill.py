@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 import offbench
-from offbench import checkpoints, dataset
-from offbench.exports import export
-from offbench.policy import load_policy
-from offbench.runs import Run, find_runs
-from offbench.survey import episodes_of
-from offbench.transitions import open_minari
+from offbench.common import checkpoints
+from offbench.data import minari_store
+from offbench.data.export import export
+from offbench.data.minari_reader import episodes_of, open_minari
+from offbench.rollouts.policy import load_policy
+from offbench.training.run import Run, find_runs
 from tests.conftest import ROOT
 
 KILLS = {"collect": 80, "overwrite": 60, "import": 40, "train": 100}  # at least 200 over collect and train
@@ -72,15 +72,15 @@ def warm() -> Iterator[Warm]:
 
 def whole(name: str) -> str:
     """Read a visible dataset to its end; return its content hash, which is the recorded one."""
-    content = dataset.ContentHash()
+    content = minari_store.ContentHash()
     for e in episodes_of(open_minari(name)):
         content.add(e.observations, e.actions, e.rewards, (bool(e.terminations[-1]), bool(e.truncations[-1])))
-    assert content.hexdigest() == dataset.provenance(dataset.read_metadata(name))["content_sha256"]
+    assert content.hexdigest() == minari_store.provenance(minari_store.read_metadata(name))["content_sha256"]
     return content.hexdigest()
 
 
 def facts(name: str) -> dict[str, Any]:
-    return {key: value for key, value in dataset.read_metadata(name).items() if key != "dataset_size"}
+    return {key: value for key, value in minari_store.read_metadata(name).items() if key != "dataset_size"}
 
 
 Check = Callable[[Path], object]
@@ -135,7 +135,7 @@ def test_collect_survives_kill_9(
             old.append(whole(name))
 
     def look(folder: Path) -> None:
-        seen = dataset.local_ids()
+        seen = minari_store.local_ids()
         content = whole(name) if seen else None
         assert seen in ([], [name])
         assert content in (right, old[-1] if kind == "overwrite" else None)
@@ -143,7 +143,7 @@ def test_collect_survives_kill_9(
         assert answer["status"] == 0 or (content == right and "exists already" in answer["stderr"])
         assert whole(name) == right
         assert facts(name) == known
-        assert [p.name for p in dataset.root().iterdir() if not p.name.endswith(".lock")] == [name]
+        assert [p.name for p in minari_store.root().iterdir() if not p.name.endswith(".lock")] == [name]
 
     trials(warm, again if kind == "overwrite" else words, kind, home, monkeypatch, prepare, look)
 
@@ -154,7 +154,7 @@ def test_import_survives_kill_9(medium: str, home: Path, warm: Warm, monkeypatch
     words = ["import-d4rl", str(file), "--id", "back-v0"]
 
     def look(folder: Path) -> None:
-        seen = dataset.local_ids()
+        seen = minari_store.local_ids()
         assert seen in ([], ["back-v0"])
         answer = warm.run(words, folder)
         assert answer["status"] == 0 or (seen and "exists already" in answer["stderr"])
@@ -223,10 +223,10 @@ def test_two_recordings_of_one_id_at_the_same_time(tiny: tuple[str, str], home: 
 def test_the_holder_of_an_id_is_named(medium: str, tiny: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     import socket
 
-    with dataset.claimed("new-v0", False):
+    with minari_store.claimed("new-v0", False):
         command = [sys.executable, "-m", "offbench", "collect", tiny[0], "--id", "new-v0"]
         found = subprocess.run(command, capture_output=True, text=True, check=False)
     assert found.returncode == 2
     assert f"new-v0 is being recorded by process {os.getpid()} on {socket.gethostname()}" in found.stderr
     assert offbench.show(medium).returns.size
-    assert [p.name for p in dataset.root().iterdir() if not p.name.endswith(".lock")] == [medium]
+    assert [p.name for p in minari_store.root().iterdir() if not p.name.endswith(".lock")] == [medium]

@@ -13,14 +13,14 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 
 from offbench import collect
-from offbench.assess import evaluate, open_policy
-from offbench.cli import main
-from offbench.environments import env_spec
-from offbench.errors import OffbenchError
-from offbench.policy import uniform
-from offbench.trust import VARIABLE, check_code
+from offbench.cli.main import main
+from offbench.common.errors import OffbenchError
+from offbench.envs.environments import env_spec
+from offbench.envs.trust import VARIABLE, check_code
+from offbench.evaluation.evaluate import evaluate, open_policy
+from offbench.rollouts.policy import uniform
+from tests.cli.test_bad_input import refusal
 from tests.faults.test_integrity import trained
-from tests.test_bad_input import refusal
 
 POLE = json.loads(env_spec("InvertedPendulum-v5"))
 OWN = "from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv as Own\n"

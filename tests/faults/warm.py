@@ -18,16 +18,16 @@ import minari  # noqa: F401
 import torch._dynamo  # noqa: F401 (what the first optimiser would import)
 
 import offbench.algos.td3_bc
-import offbench.d4rl
-import offbench.launch
-import offbench.record
-import offbench.rollout
-import offbench.training
-from offbench.cli import main
-from offbench.environments import env_spec
+import offbench.data.collect
+import offbench.data.import_d4rl
+import offbench.rollouts.rollouts
+import offbench.training.train
+import offbench.training.trainer
+from offbench.cli.main import main
+from offbench.envs.environments import env_spec
 
 
-class HereRollouts(offbench.rollout.Rollouts):
+class HereRollouts(offbench.rollouts.rollouts.Rollouts):
     """Evaluations in the training process itself: 200 trainings need not start 200 worker processes.
 
     Trainings with their workers are killed in test_interrupts.py.
@@ -46,7 +46,7 @@ def child(command: dict[str, Any]) -> NoReturn:
         with open("stderr.txt", "w") as file:
             os.dup2(file.fileno(), 2)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        offbench.training.Rollouts = HereRollouts  # type: ignore[misc]
+        offbench.training.trainer.Rollouts = HereRollouts  # type: ignore[misc]
         main(command["words"])
         status = 0
     except SystemExit as done:

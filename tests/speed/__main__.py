@@ -11,10 +11,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from offbench.files import write_bytes
-from offbench.provenance import hardware, versions
-from offbench.tables import markdown
-from offbench.workers import cores
+from offbench.common.files import write_bytes
+from offbench.common.processes import cores
+from offbench.common.provenance import hardware, versions
+from offbench.common.tables import markdown
 from tests.speed.rows import PEERS, Row, growth, rows
 from tests.speed.side import Side
 
@@ -116,7 +116,7 @@ def main() -> None:
         raise SystemExit(f"no {PEERS}: run `make bench`, which installs d3rlpy and JAX there")
     with tempfile.TemporaryDirectory() as place:
         os.environ |= {"MINARI_DATASETS_PATH": f"{place}/minari", "OFFBENCH_CACHE": f"{place}/cache"}
-        from offbench.record import collect
+        from offbench.data.collect import collect
 
         name = collect("hopper", "medium", steps=20_000 if arguments.quick else 1_000_000)
         results = []

@@ -19,14 +19,14 @@ from typing import Any
 
 import torch
 
-from offbench.calibrate import made_up
-from offbench.devices import PRECISIONS, arithmetic, pick_device
-from offbench.files import write_json
-from offbench.provenance import versions
-from offbench.recipes import load_recipe
-from offbench.registry import load_algorithm
-from offbench.settings import build
-from offbench.stack import Stack
+from offbench.benchmarks.throughput import made_up
+from offbench.common.files import write_json
+from offbench.common.provenance import versions
+from offbench.common.settings import build
+from offbench.envs.recipes import load_recipe
+from offbench.training.devices import PRECISIONS, arithmetic, pick_device
+from offbench.training.registry import load_algorithm
+from offbench.training.stack import Stack
 
 MEASURE = 5.0  # seconds of a figure
 STACKS = (1, 5, 25, 125, 250)

@@ -15,15 +15,15 @@ import mujoco
 import numpy as np
 import torch
 
-from offbench import perceptron
-from offbench.capture import Recording
-from offbench.environments import make_env
-from offbench.files import write_bytes
-from offbench.ladder import read_ladder
-from offbench.provenance import hardware
-from offbench.recipes import load_recipe
-from offbench.rollout import LANES, Episode, Task, play
-from offbench.tables import markdown
+from offbench.agents.ladder import read_ladder
+from offbench.algorithm import mlp
+from offbench.algorithm.capture import Recording
+from offbench.common.files import write_bytes
+from offbench.common.provenance import hardware
+from offbench.common.tables import markdown
+from offbench.envs.environments import make_env
+from offbench.envs.recipes import load_recipe
+from offbench.rollouts.rollouts import LANES, Episode, Task, play
 from tests.speed.__main__ import DOCS
 from tests.speed.sides import ENV, stack_of
 
@@ -96,14 +96,14 @@ def calls(recording: Recording) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield each call of a replay, those within the networks' passes one by one, with the part that it belongs to."""
     for function, arguments, named in recording.calls:
         owner = getattr(function, "__self__", None)
-        if isinstance(owner, perceptron.Pass):
+        if isinstance(owner, mlp.Pass):
             for into, source in owner._loads:
                 yield REST, partial(np.copyto, into, source)
             for h, layer, out, activate in owner._steps:
                 yield PRODUCTS, partial(np.matmul, h, layer, out=out)
                 if activate is not None:
                     yield ACTIVATIONS, activate
-        elif isinstance(owner, perceptron.PassBack):
+        elif isinstance(owner, mlp.PassBack):
             for inner, inputs in owner._calls:
                 yield PRODUCTS if inner is np.matmul else ACTIVATIONS, partial(inner, *inputs)
         else:

@@ -6,8 +6,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from offbench.provenance import has_bfloat16
-from offbench.workers import cores
+from offbench.common.processes import cores
+from offbench.common.provenance import has_bfloat16
 
 PEERS = Path(__file__).parent.parent.parent / ".venv-peers" / "bin" / "python"
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from tests.speed.side import Work, serve
 
 if TYPE_CHECKING:
-    from offbench.stack import Stack
+    from offbench.training.stack import Stack
 
 ENV = "hopper"
 ARITHMETIC = contextlib.ExitStack()  # what trainings set; left as this process ends
@@ -40,10 +40,10 @@ def stack_of(
     algorithm: str, runs: int = 1, rows: int = 100_000, hidden: str = "256,256", precision: str = "float32"
 ) -> Stack:
     """A stack on random transitions of hopper's shapes."""
-    from offbench.devices import arithmetic
-    from offbench.registry import load_algorithm
-    from offbench.settings import build
-    from offbench.stack import Stack
+    from offbench.common.settings import build
+    from offbench.training.devices import arithmetic
+    from offbench.training.registry import load_algorithm
+    from offbench.training.stack import Stack
 
     ARITHMETIC.enter_context(arithmetic("cpu", precision))
     kind = load_algorithm(algorithm)
@@ -53,16 +53,16 @@ def stack_of(
 
 def _member(algorithm: str, config: Any, rows: int) -> Any:
     """A run on random transitions of hopper's shapes."""
-    from offbench import calibrate
-    from offbench.recipes import load_recipe
+    from offbench.benchmarks import throughput
+    from offbench.envs.recipes import load_recipe
 
-    calibrate.ROWS = rows
-    return calibrate.made_up(algorithm, config, load_recipe(ENV).env_spec())
+    throughput.ROWS = rows
+    return throughput.made_up(algorithm, config, load_recipe(ENV).env_spec())
 
 
 def record(workers: str) -> Work:
     """`offbench collect`, from the command to the Minari dataset; a unit is one transition."""
-    from offbench.record import collect
+    from offbench.data.collect import collect
 
     def work() -> int:
         collect(ENV, "medium", steps=200_000, workers=int(workers), overwrite=True)
@@ -102,8 +102,8 @@ def sb3_model(level: str) -> Any:
     import torch
     from stable_baselines3 import SAC
 
-    from offbench.ladder import read_ladder
-    from offbench.recipes import load_recipe
+    from offbench.agents.ladder import read_ladder
+    from offbench.envs.recipes import load_recipe
 
     torch.set_num_threads(1)
     recipe = load_recipe(ENV)
@@ -126,7 +126,7 @@ def sb3_model(level: str) -> Any:
 
 def physics(workers: str) -> Work:
     """mj_step alone, in so many processes, along recorded episodes; a unit is one step of the environment."""
-    from offbench.record import collect
+    from offbench.data.collect import collect
 
     name = collect(ENV, "medium", steps=2000, workers=1, overwrite=True, dataset_id="physics-v0")
     count = int(workers)
@@ -176,13 +176,13 @@ def load_cached(dataset_id: str) -> Work:
 
 def load_unchecked(dataset_id: str) -> Work:
     """The same without what notices a changed cache and a dataset that is replaced while it is read."""
-    from offbench import stamps, transitions
+    from offbench.data import file_stamps, transitions
 
     def unchecked(_: object, recorded: dict[str, object]) -> dict[str, object]:
         return recorded
 
-    known = stamps.dataset_stamps(dataset_id)
-    stamps.dataset_stamps = lambda _: known
+    known = file_stamps.dataset_stamps(dataset_id)
+    file_stamps.dataset_stamps = lambda _: known
     transitions.checked = unchecked  # type: ignore[assignment]
     return load_cached(dataset_id)
 
@@ -202,9 +202,9 @@ def load_minari(dataset_id: str) -> Work:
 
 def evaluate(workers: str, episodes: str = "20") -> Work:
     """offbench's evaluation of the expert; a unit is one episode."""
-    from offbench.ladder import read_ladder
-    from offbench.recipes import load_recipe
-    from offbench.rollout import Rollouts, result
+    from offbench.agents.ladder import read_ladder
+    from offbench.envs.recipes import load_recipe
+    from offbench.rollouts.rollouts import Rollouts, result
 
     recipe = load_recipe(ENV)
     assert recipe.folder is not None

@@ -23,9 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from offbench.algorithm import Batch, Draw, PolicyParts
-from offbench.networks import Learned, Network, Target
-from offbench.settings import setting
+from offbench.algorithm import Batch, Draw, Learned, Network, PolicyParts, Target, setting
 
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 MOST = 100.0  # weight of a single sample

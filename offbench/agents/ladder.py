@@ -1,0 +1,172 @@
+"""The ladder: the rungs of a behaviour agent that recording needs, as they lie in a folder.
+
+    ladder.json  ladder.csv  policies/*.safetensors  medium-replay.hdf5        (built by offbench.agents.build_ladder)
+
+Returns are of the sampling policy, normalised between the uniform-random and the expert reference.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offbench.common.errors import OffbenchError
+from offbench.common.files import damage, read_json, regular
+from offbench.common.scores import normalize
+from offbench.envs.environments import same_environment
+from offbench.envs.recipes import Recipe, load_recipe, names
+from offbench.envs.same_physics import warn_other_physics
+from offbench.rollouts.policy import Policy, load_policy
+
+BEHAVIOUR = Path("behaviour")  # where trainings live unless the user says otherwise
+MEDIUM = 1 / 3  # of the expert's normalised return
+MEDIUM_AT_MOST = 0.45  # a rung beyond this is no medium while there is another
+POLICY_NAME = re.compile(r"\w[\w.-]*\.safetensors")  # a file of the ladder's own folder, nothing else
+REFERENCE = ("return", "low", "high", "episodes")  # what each reference must have
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One measured rung. `low` and `high` are the 95% interval of the mean return."""
+
+    step: int
+    role: str
+    policy: str
+    ret: float
+    low: float
+    high: float
+    episodes: int
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """A ladder's folder, read."""
+
+    folder: Path
+    info: dict[str, Any]
+    rungs: tuple[Rung, ...]
+
+    @property
+    def random_return(self) -> float:
+        """Mean return of the uniform-random policy: the reference's 0."""
+        return float(self.info["references"]["random"]["return"])
+
+    @property
+    def expert_return(self) -> float:
+        """Mean return of the expert: the reference's 100."""
+        return float(self.info["references"]["expert"]["return"])
+
+    def fraction(self, rung: Rung) -> float:
+        """Return a rung's normalised return, 1 for the expert's."""
+        return normalize(rung.ret, self.random_return, self.expert_return) / 100
+
+    def nearest(self, fraction: float) -> Rung:
+        """Return the kept rung whose measured normalised return lies nearest `fraction`."""
+        return min(self.rungs, key=lambda rung: abs(self.fraction(rung) - fraction))
+
+    def role(self, role: str) -> Rung:
+        """Return the rung that is `medium` or `expert`."""
+        return next(rung for rung in self.rungs if role in rung.role.split("+"))
+
+    def load(self, rung: Rung) -> Policy:
+        """Read a rung's policy."""
+        return load_policy(self.folder / "policies" / rung.policy)
+
+    def check(self, recipe: Recipe) -> Ladder:
+        """Return itself; raise OffbenchError if it is of another environment than the recipe."""
+        kwargs = json.loads(json.dumps(dict(recipe.env_kwargs)))
+        if (self.info.get("env_id"), self.info.get("env_kwargs")) != (recipe.env_id, kwargs):
+            raise OffbenchError(
+                f"the ladder in {self.folder} is of {self.info.get('env_id')} {self.info.get('env_kwargs')}, "
+                f"the recipe is of {recipe.env_id} {kwargs}; delete that folder, or rename the recipe"
+            )
+        return self
+
+    @property
+    def replay(self) -> Path:
+        """The transitions of medium-replay."""
+        return self.folder / "medium-replay.hdf5"
+
+
+def read_ladder(folder: Path) -> Ladder | None:
+    """Read a ladder's folder, or return None if there is none. Raises OffbenchError if it is damaged."""
+    if not (folder / "ladder.json").exists():
+        return None
+    info = read_json(folder / "ladder.json")
+    with damage(f"the ladder in {folder} is damaged", "delete it and build it again with `offbench behaviour`"):
+        with open(folder / "ladder.csv", newline="", encoding="utf-8", opener=regular) as file:
+            rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
+        ladder = Ladder(folder, info, rungs)
+        known = [float(info["references"][name][key]) for name in ("random", "expert") for key in REFERENCE]
+        known += [int(info["medium_replay"]["transitions"]), int(info["levels"]["medium"])]
+        if not (np.isfinite(known).all() and ladder.role("medium") and ladder.role("expert")):
+            raise ValueError("its references are not numbers")
+        if not ladder.random_return < ladder.expert_return or not isinstance(info["medium_replay"]["sha256"], str):
+            raise ValueError("its references are out of order, or medium-replay has no hash")
+        if gone := [rung.policy for rung in rungs if not (folder / "policies" / rung.policy).is_file()]:
+            raise ValueError(f"it lacks policies/{gone[0]}")
+        if not isinstance(info.get("versions", {}), dict):
+            raise ValueError("its versions are no table")
+    return ladder
+
+
+def folder_of(recipe: Recipe, seed: int, behaviour_dir: Path) -> Path:
+    """Return where the training of a recipe and seed lives."""
+    return behaviour_dir / recipe.name / f"seed-{seed}"
+
+
+def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool = False) -> Ladder | None:
+    """Return the shipped ladder (unless `retrain`), else the one trained here, else None.
+
+    Raises:
+        OffbenchError: it is damaged, or of another environment.
+    """
+    shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder and not retrain else None
+    found = shipped or read_ladder(folder_of(recipe, 0, behaviour_dir) / "ladder")
+    if found is None:
+        return None
+    found.check(recipe)
+    if not shipped:
+        print(f"offbench: using the behaviour agent trained here: {found.folder}", file=sys.stderr)
+        _warn_other_recipe(found, recipe)
+    warn_other_physics(f"the behaviour agent of {recipe.name}", found.info.get("versions", {}), recipe.env_spec())
+    return found
+
+
+def _warn_other_recipe(ladder: Ladder, recipe: Recipe) -> None:
+    """Say which settings of the recipe have been changed since the agent was trained."""
+    known, wanted = ladder.info.get("sac"), json.loads(json.dumps(dataclasses.asdict(recipe.sac)))
+    changed = [key for key, value in wanted.items() if isinstance(known, dict) and known.get(key, value) != value]
+    if changed:
+        print(
+            f"offbench: warning: that agent was trained with other [sac] settings than the recipe's "
+            f"({', '.join(changed)}); delete {ladder.folder.parent} to train it anew",
+            file=sys.stderr,
+        )
+
+
+def shipped_references(spec: str) -> tuple[float, float] | None:
+    """Return the (random, expert) returns shipped for an environment (EnvSpec JSON); None if there are none of it."""
+    for name in names():
+        recipe = load_recipe(name)
+        # the id first: making the spec of every recipe takes a while
+        if recipe.env_id != json.loads(spec).get("id") or not same_environment(recipe.env_spec(), spec):
+            continue
+        if recipe.folder and (ladder := read_ladder(recipe.folder / "behaviour")):
+            return ladder.random_return, ladder.expert_return
+    return None
+
+
+def _rung(row: dict[str, str]) -> Rung:
+    mean, low, high = (float(row[key]) for key in ("return", "low", "high"))
+    if not np.isfinite([mean, low, high]).all() or not POLICY_NAME.fullmatch(row["policy"]):
+        raise ValueError(f"rung {row['step']}")
+    return Rung(int(row["step"]), row["role"], row["policy"], mean, low, high, int(row["episodes"]))

@@ -1,0 +1,115 @@
+"""medium-replay: every transition of a behaviour agent's training up to the medium rung, as episodes.
+
+segment files [steps, envs, ...]  ->  per segment, per environment stream: episodes
+HDF5: observations [N + E, obs] (T + 1 rows an episode, end to end)   actions [N, act] in [-1, 1]
+      rewards [N]   lengths [E]   terminated [E]   stream [E]         (N transitions, E episodes)
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from offbench.common.arrays import Array
+from offbench.common.errors import OffbenchError
+from offbench.common.files import read_bytes, sha256, write_bytes
+from offbench.rollouts.rollouts import Episode
+
+if TYPE_CHECKING:
+    from offbench.agents.sac import Training
+
+CHUNK_ROWS = 65_536
+NO_SEED = -1  # episodes of a training have no reset seed of their own
+
+
+class Piece(NamedTuple):
+    """An episode of the training as the replay buffer holds it: float32, actions in [-1, 1]."""
+
+    observations: Array
+    actions: Array
+    rewards: Array
+    terminated: bool
+    stream: int
+
+
+def replay_episodes(training: Training, until: int) -> Iterator[Piece]:
+    """Yield the episodes of a training's first `until` steps, segment by segment, stream by stream."""
+    segment = training.recipe.sac.segment
+    for end in range(segment, until + 1, segment):
+        with np.load(training.transitions(end), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        for stream in range(arrays["rewards"].shape[1]):
+            yield from _cut({name: array[:, stream] for name, array in arrays.items()}, stream)
+
+
+def _cut(arrays: dict[str, Array], stream: int) -> Iterator[Piece]:
+    """Cut one stream of a segment where its episodes end. SB3's `dones` holds both kinds of end."""
+    dones, timeouts = arrays["dones"].astype(bool), arrays["timeouts"].astype(bool)
+    first = 0
+    for last in [*np.flatnonzero(dones), len(dones) - 1]:
+        if last < first:
+            continue  # the segment ended with an episode's end
+        rows = slice(first, last + 1)
+        observations = np.concatenate([arrays["observations"][rows], arrays["next_observations"][last : last + 1]])
+        ended = bool(dones[last] and not timeouts[last])
+        yield Piece(observations, arrays["actions"][rows], arrays["rewards"][rows], ended, stream)
+        first = last + 1
+
+
+def save_replay(path: Path, pieces: Iterator[Piece]) -> dict[str, Any]:
+    """Write episodes to one compressed HDF5 file; return its transitions, episodes and SHA-256."""
+    whole = list(pieces)
+    arrays: dict[str, Any] = {
+        "observations": np.concatenate([p.observations for p in whole]).astype(np.float32),
+        "actions": np.concatenate([p.actions for p in whole]).astype(np.float32),
+        "rewards": np.concatenate([p.rewards for p in whole]).astype(np.float32),
+        "lengths": np.array([len(p.rewards) for p in whole], np.int64),
+        "terminated": np.array([p.terminated for p in whole]),
+        "stream": np.array([p.stream for p in whole], np.int64),
+    }
+    data = io.BytesIO()
+    with h5py.File(data, "w") as file:
+        for name, array in arrays.items():
+            # column by column and byte by byte: what the floats of one quantity share lies together
+            chunks = (min(len(array), CHUNK_ROWS), *(1 for _ in array.shape[1:]))
+            file.create_dataset(name, data=array, chunks=chunks, compression="gzip", compression_opts=6, shuffle=True)
+    write_bytes(path, data.getvalue())
+    return {"transitions": len(arrays["rewards"]), "episodes": len(whole), "sha256": sha256(data.getvalue())}
+
+
+def load_replay(path: Path, expected_sha256: str, low: Array, high: Array, dtype: Any) -> Iterator[Episode]:
+    """Yield the recorded episodes, actions in the environment's bounds, observations in its precision.
+
+    Raises:
+        OffbenchError: the file is missing or is not the one its ladder describes.
+    """
+    try:
+        data = read_bytes(path)
+    except OSError as error:
+        raise OffbenchError(
+            f"cannot read {path}: {error.strerror or error}; build the ladder again with `offbench behaviour`"
+        ) from None
+    if sha256(data) != expected_sha256:
+        raise OffbenchError(
+            f"{path} is damaged (its SHA-256 differs from the ladder's); reinstall, or build the ladder again"
+        )
+    with h5py.File(io.BytesIO(data), "r") as file:
+        arrays = {name: values[()] for name, values in file.items()}
+    span = (high.astype(np.float64) - low) / 2
+    row = step = 0
+    for length, terminated in zip(arrays["lengths"], arrays["terminated"], strict=True):
+        actions = np.clip(low + (arrays["actions"][step : step + length] + 1.0) * span, low, high)
+        yield Episode(
+            NO_SEED,
+            arrays["observations"][row : row + length + 1].astype(dtype),
+            actions.astype(np.float32),
+            arrays["rewards"][step : step + length].astype(np.float64),
+            bool(terminated),
+            not terminated,
+        )
+        row, step = row + length + 1, step + length

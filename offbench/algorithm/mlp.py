@@ -1,0 +1,299 @@
+"""The forward and backward pass of many equal perceptrons.
+
+    flat [copies, runs, P] = W0 [in, h] | b0 [h] | W1 [h, h] | b1 [h] | ... | 0
+    inputs [runs, batch, dim], concatenated to x [runs, batch, in]   ->   outputs [copies, runs, batch, out]
+
+On a GPU a layer of all perceptrons is one batched product, and autograd does the way back (`stacked`).
+
+On a CPU one perceptron goes after the other, so that its arrays stay in the cache, and its passes are written out
+(`Pass`): buffers are kept between calls, products are NumPy's (OpenBLAS writes into them), and only gradients that
+somebody asks for are computed. A layer's weights and bias lie one after the other, so they are one matrix, and
+the inputs of each layer have a last column of ones:
+
+    [h | 1] [batch, in + 1]  @  [W; b] [in + 1, out]          one product gives h W + b,
+    [h | 1].T @ gradient                                      and one the gradients of W and b
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from offbench.algorithm.capture import one_call
+
+_WAY = ContextVar("way", default="numpy")
+Array = np.ndarray[Any, np.dtype[np.float32]]
+ALIGNED = 16  # float32 numbers of 64 bytes: rows of buffers begin where a processor's wide registers do
+
+
+def perceptrons(flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str) -> Tensor:
+    """Return the outputs [copies, runs, batch, out] of perceptrons with layers of `sizes`, differentiable once.
+
+    Args:
+        flat: all weights and biases [copies, runs, P]; what lies behind the last bias has no effect.
+        inputs: each [runs, batch, dim].
+        activation: of the hidden layers, relu or tanh.
+    """
+    way = _WAY.get()
+    if way == "bfloat16":
+        return _in_bfloat16(flat, inputs, sizes, activation)
+    if flat.device.type != "cpu" or flat.dtype != torch.float32 or way == "pytorch":
+        return stacked(flat, inputs, sizes, activation)
+    outputs: Tensor = _Perceptrons.apply(flat, tuple(sizes), activation, *inputs)  # type: ignore[no-untyped-call]
+    return outputs
+
+
+@contextmanager
+def products_by(way: str) -> Iterator[None]:
+    """Choose how `perceptrons` multiplies.
+
+    Args:
+        way: `numpy` on a CPU, the default; `pytorch`, whose tools do not see NumPy's products; or `bfloat16`.
+    """
+    token = _WAY.set(way)
+    try:
+        yield
+    finally:
+        _WAY.reset(token)
+
+
+def _in_bfloat16(flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str) -> Tensor:
+    """Return what `perceptrons` does, with products in bfloat16; on a CPU one perceptron goes after the other."""
+    if flat.device.type != "cpu":
+        return stacked(flat, inputs, sizes, activation, torch.bfloat16)
+    copies, runs = flat.shape[:2]
+    outputs = [
+        stacked(flat[copy, run][None, None], [x[run : run + 1] for x in inputs], sizes, activation, torch.bfloat16)
+        for copy, run in itertools.product(range(copies), range(runs))
+    ]
+    return torch.cat(outputs).view(copies, runs, *outputs[0].shape[2:])
+
+
+def stacked(
+    flat: Tensor,
+    inputs: Sequence[Tensor],
+    sizes: Sequence[int],
+    activation: str,
+    dtype: torch.dtype | None = None,
+) -> Tensor:
+    """Return what `perceptrons` does, all of them at once, differentiable as often as one likes.
+
+    Args:
+        dtype: of all products but the last layer's; by default that of `flat`, as the last layer's always is: a Q of
+            300 needs more than bfloat16's 8 bits.
+    """
+    x = torch.cat(list(inputs), -1)
+    copies, (runs, batch, width) = flat.shape[0], x.shape
+    h = x.expand(copies, runs, batch, width).reshape(copies * runs, batch, width)
+    layers = _layers(flat.reshape(copies * runs, -1), sizes)
+    for both in layers[:-1]:
+        both = both.to(dtype or flat.dtype)
+        h = torch.baddbmm(both[:, -1:], h.to(both.dtype), both[:, :-1])
+        h = h.relu() if activation == "relu" else h.tanh()
+    last = layers[-1]
+    return torch.baddbmm(last[:, -1:], h.to(last.dtype), last[:, :-1]).view(copies, runs, batch, -1)
+
+
+def _layers(flat: Tensor, sizes: Sequence[int]) -> list[Tensor]:
+    """Return each layer's weights and bias as one matrix [.., in + 1, out], views of `flat` [.., P]."""
+    layers, first = [], 0
+    for i, o in itertools.pairwise(sizes):
+        layers.append(flat[..., first : first + (i + 1) * o].view(*flat.shape[:-1], i + 1, o))
+        first += (i + 1) * o
+    return layers
+
+
+class _Perceptrons(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, flat: Tensor, sizes: tuple[int, ...], activation: str, *inputs: Tensor) -> Tensor:
+        keep = any(ctx.needs_input_grad)
+        with one_call() as recording:
+            ctx.made = made = Pass(flat, inputs, sizes, activation, keep)
+            made.run()
+        if recording:
+            recording.add(("forward", sizes, activation, keep), (flat, inputs), made.outputs, (made.run, (), {}))
+        ctx.save_for_backward(flat)  # autograd sees if it was changed since
+        return made.outputs
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        (flat,) = ctx.saved_tensors
+        needs = ctx.needs_input_grad[0], ctx.needs_input_grad[3:]
+        with one_call() as recording:
+            back = PassBack(ctx.made, flat, grads[0], *needs)
+            back.run()
+        found = (back.of_flat, *back.of_inputs)
+        if recording:
+            reads, writes = (ctx.made.outputs, grads[0]), [one for one in found if one is not None]
+            recording.add(("backward", needs), reads, writes, (back.run, (), {}))
+        return found[0], None, None, *found[1:]
+
+
+class Pass:
+    """A forward pass on the CPU, with buffers of its own.
+
+    Args:
+        keep: whether a backward pass may follow, so that the layers' activations must not be overwritten.
+    """
+
+    def __init__(
+        self, flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str, keep: bool
+    ) -> None:
+        self.sizes, self.activation = sizes, activation
+        self.shape = (flat.shape[0], *inputs[0].shape[:2])  # copies, runs, batch
+        copies, runs, batch = self.shape
+        self.widths = [x.shape[-1] for x in inputs]
+        self.outputs = torch.empty(*self.shape, sizes[-1])
+        x = [_with_ones(batch, sizes[0]) for _ in range(runs)]
+        starts = [0, *itertools.accumulate(self.widths)]
+        self._loads = [
+            (x[run][:, start:end], part[run])
+            for start, end, part in zip(starts, starts[1:], (_array(part) for part in inputs), strict=False)
+            for run in range(runs)
+        ]
+        self.layers = [_array(layer) for layer in _layers(flat, sizes)]  # each [copies, runs, in + 1, out]
+        # what goes into each layer, [batch, in + 1], of each perceptron
+        self.into: dict[tuple[int, int], list[Array]] = {}
+        self._steps: list[tuple[Array, Array, Array, Callable[[], Any] | None]] = []
+        outputs = _array(self.outputs)
+        for copy, run in itertools.product(range(copies), range(runs)):
+            h, self.into[copy, run] = x[run], [x[run]]
+            for layer, width in enumerate(sizes[1:-1]):
+                make = _with_ones if keep else _shared(f"layer {layer}", _with_ones)
+                into = make(batch, width)
+                hidden = torch.from_numpy(into[:, :-1])
+                activate = hidden.relu_ if activation == "relu" else hidden.tanh_
+                self._steps.append((h, self.layers[layer][copy, run], into[:, :-1], activate))
+                h = into
+                self.into[copy, run].append(into)
+            self._steps.append((h, self.layers[-1][copy, run], outputs[copy, run], None))
+
+    def run(self) -> None:
+        """Compute `outputs`."""
+        for into, source in self._loads:
+            np.copyto(into, source)
+        for h, layer, out, activate in self._steps:
+            np.matmul(h, layer, out=out)
+            if activate is not None:
+                activate()
+
+
+class PassBack:
+    """The backward pass of a forward pass.
+
+    Attributes:
+        of_flat, of_inputs: the gradients; None where nobody needs them.
+    """
+
+    def __init__(
+        self, forward: Pass, flat: Tensor, grad: Tensor, needs_flat: bool, needs_inputs: Sequence[bool]
+    ) -> None:
+        copies, runs, batch = forward.shape
+        sizes, widths = forward.sizes, forward.widths
+        self.of_flat = torch.zeros_like(flat) if needs_flat else None
+        of_layers = [_array(layer) for layer in _layers(self.of_flat, sizes)] if self.of_flat is not None else None
+        self.of_inputs = [
+            torch.empty(runs, batch, width) if needed else None
+            for width, needed in zip(widths, needs_inputs, strict=True)
+        ]
+        self._calls: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
+        last = _array(grad)
+        if not grad.is_contiguous():
+            last = np.empty(grad.shape, np.float32)
+            self._calls.append((np.copyto, (last, _array(grad))))
+        for copy, run in itertools.product(range(copies), range(runs)):
+            g = last[copy, run]
+            for layer in reversed(range(len(sizes) - 1)):
+                h, weight = forward.into[copy, run][layer], forward.layers[layer][copy, run][:-1]
+                if of_layers is not None:
+                    self._calls.append((np.matmul, (h.T, g, of_layers[layer][copy, run])))
+                if layer:
+                    before = _shared(f"gradient {layer % 2}", _rows)(batch, sizes[layer])
+                    self._product(g, weight.T, before)
+                    self._calls.append(_through(forward.activation, before, h[:, :-1]))
+                    g = before
+                    continue
+                start = 0
+                for width, found in zip(widths, self.of_inputs, strict=True):
+                    if found is not None:
+                        part, of_input = weight[start : start + width].T, _array(found)[run]
+                        if copy == 0:
+                            self._product(g, part, of_input)
+                        else:
+                            other = _shared("gradient of an input", _rows)(batch, width)
+                            self._product(g, part, other)
+                            self._calls.append((np.add, (of_input, other, of_input)))
+                    start += width
+
+    def _product(self, a: Array, b: Array, out: Array) -> None:
+        """Add the call of a @ b; NumPy is slow at outer products, those of a layer with one output."""
+        if a.shape[1] == 1:
+            arguments = [torch.from_numpy(array) for array in (a, b, out)]
+            self._calls.append((_multiply, tuple(arguments)))
+        else:
+            self._calls.append((np.matmul, (a, b, out)))
+
+    def run(self) -> None:
+        """Compute `of_flat` and `of_inputs`."""
+        for function, arguments in self._calls:
+            function(*arguments)
+
+
+def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
+    torch.mul(a, b, out=out)
+
+
+def _through(activation: str, gradient: Array, h: Array) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    """Return the call that turns the gradient of an activation's output h into that of its input, in place."""
+    return (_through_relu if activation == "relu" else _through_tanh), tuple(map(torch.from_numpy, (gradient, h)))
+
+
+def _through_relu(gradient: Tensor, h: Tensor) -> None:
+    torch.ops.aten.threshold_backward.grad_input(gradient, h, 0, grad_input=gradient)
+
+
+def _through_tanh(gradient: Tensor, h: Tensor) -> None:
+    torch.ops.aten.tanh_backward.grad_input(gradient, h, grad_input=gradient)
+
+
+def _array(tensor: Tensor) -> Array:
+    """Return a NumPy array that shares a tensor's memory."""
+    array: Array = tensor.detach().numpy()
+    return array
+
+
+def _rows(batch: int, width: int) -> Array:
+    """Return an array [batch, width] whose rows are aligned."""
+    padded = -(-width // ALIGNED) * ALIGNED
+    return torch.zeros(batch, padded).numpy()[:, :width]
+
+
+def _with_ones(batch: int, width: int) -> Array:
+    """Return an array [batch, width + 1] whose last column is 1."""
+    array = _rows(batch, width + 1)
+    array[:, -1] = 1
+    return array
+
+
+_SCRATCH = threading.local()
+
+
+def _shared(use: str, make: Callable[[int, int], Array]) -> Callable[[int, int], Array]:
+    """Return `make` whose arrays all passes of this thread share, for what is used up within one pass."""
+
+    def shared(batch: int, width: int) -> Array:
+        arrays: dict[Any, Array] = _SCRATCH.__dict__.setdefault("arrays", {})
+        key = (use, batch, width)
+        if key not in arrays:
+            arrays[key] = make(batch, width)
+        return arrays[key]
+
+    return shared

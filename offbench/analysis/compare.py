@@ -1,0 +1,233 @@
+"""`compare`: two groups of runs, paired over datasets and seeds, with a plain verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from offbench.analysis.results import REFERENCES, Entry, Results, Task, Trained, read_results, window_words
+from offbench.analysis.statistics import Estimate, Paired, improvement, paired
+from offbench.common.errors import OffbenchError, unknown
+from offbench.common.text import counted
+from offbench.training.registry import algorithm_names
+from offbench.training.run import folder_name
+
+LEVEL = 0.05  # a difference is evidence below this p, if its interval leaves out 0 too
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The scores of A's and B's run of one dataset and seed."""
+
+    dataset: str
+    seed: int
+    a: float
+    b: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A against B over the datasets and seeds that both have.
+
+    Attributes:
+        a, b: the groups as selected.
+        pairs: what everything else is computed from.
+        reference: what the scores are normalised by, in words.
+        statistics: difference of A - B.
+        chance: probability that a run of A scores above one of B, over the paired runs.
+        unpaired: how many runs of either have no partner and are left out.
+        windows: which evaluations are behind the scores of A's and of B's paired runs, in words.
+        comparable: whether both runs of each pair are scored over evaluations at the same steps.
+        unfinished: how many of the paired runs have not reached their last step, or have diverged.
+    """
+
+    a: str
+    b: str
+    pairs: list[Pair]
+    reference: str
+    statistics: Paired
+    chance: Estimate
+    unpaired: int
+    windows: tuple[str, str]
+    comparable: bool
+    unfinished: int
+
+    @property
+    def verdict(self) -> str:
+        """Who is better, or that there is no evidence of a difference."""
+        estimate, sizes = self.statistics.difference, Counter(pair.dataset for pair in self.pairs)
+        counts = sorted(set(sizes.values()))
+        over = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+        over += " seed" if counts[-1] == 1 else " seeds"
+        over += f" on {len(sizes)} datasets" if len(sizes) > 1 else ""
+        if not self.comparable:
+            return "no verdict: the scores are of evaluations at different steps"
+        sign = favoured(self.statistics)
+        if not sign:
+            return f"no evidence of a difference at {over}"
+        return f"{self.a if sign > 0 else self.b} is better: +{estimate if sign > 0 else -estimate} at {over}"
+
+    def lines(self) -> list[str]:
+        """Return the comparison as text."""
+        found = self.statistics
+        effect = "-" if found.standardised is None else f"{found.standardised:+.2f}"
+        percent = self.chance.percent()
+        lines = [f"{self.a} against {self.b} ({self.reference})", ""]
+        lines += [
+            *self._pair_lines(),
+            "",
+            f"mean difference             {found.difference.value:+.1f} {found.difference.span()}".rstrip(),
+            f"standardised                {effect} (over the deviation of the {found.pairs} paired differences)",
+            f"probability of improvement  {percent.value:.0f}% {percent.span()}".rstrip(),
+            f"sign-flip test              p = {found.p:.3g}",
+        ]
+        if not self.comparable:
+            lines.append(
+                f"note: evaluated at different steps: {self.a} {self.windows[0]}; {self.b} {self.windows[1]}; train "
+                "both to the same --steps with the same --eval-every"
+            )
+        if self.unfinished:
+            lines.append(f"note: {self.unfinished} of the paired runs did not reach their last step")
+        if self.unpaired:
+            verbs = ("has", "is") if self.unpaired == 1 else ("have", "are")
+            lines.append(
+                f"note: {counted(self.unpaired, 'run')} {verbs[0]} no partner of the same dataset and seed "
+                f"and {verbs[1]} left out"
+            )
+        return [*lines, "", self.verdict]
+
+    def _pair_lines(self) -> list[str]:
+        """Return the scores of each pair below a header that says whose they are."""
+        header = ["dataset", "seed", self.a, self.b, "difference"]
+        rows = [[p.dataset, str(p.seed), f"{p.a:.1f}", f"{p.b:.1f}", f"{p.a - p.b:+.1f}"] for p in self.pairs]
+        widths = [max(len(line[i]) for line in [header, *rows]) for i in range(len(header))]
+        return [
+            "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]) for line in [header, *rows]
+        ]
+
+    def row(self) -> dict[str, Any]:
+        """Return the comparison as JSON has it."""
+        found, chance = self.statistics, self.chance
+        return {
+            "a": self.a,
+            "b": self.b,
+            "reference": self.reference,
+            "difference": found.difference.value,
+            "low": found.difference.low,
+            "high": found.difference.high,
+            "standardised": found.standardised,
+            "p": found.p,
+            "probability_of_improvement": chance.value,
+            "probability_low": chance.low,
+            "probability_high": chance.high,
+            "pairs": [dataclasses.asdict(pair) for pair in self.pairs],
+            "unpaired": self.unpaired,
+            "unfinished": self.unfinished,
+            "comparable": self.comparable,
+            "verdict": self.verdict,
+        }
+
+
+def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
+    """Compare two groups of runs over the datasets and seeds that both have.
+
+    Args:
+        a, b: ALGO or ALGO/VARIANT, e.g. `td3_bc` and `bdb/beta=0.5`, a variant as a run's folder or a table has
+            it; an algorithm alone is its default variant, or its only one.
+        runs: the folder of the run directories.
+
+    Raises:
+        OffbenchError: no such group, the two are one, or they share no dataset and seed.
+    """
+    results = read_results(runs)
+    groups = select(results, a), select(results, b)
+    if groups[0] == groups[1]:
+        raise OffbenchError(f"{a} and {b} are the same runs; give two groups")
+    both = partners(*groups)
+    if not both:
+        raise OffbenchError(f"{a} and {b} share no dataset with a seed in common: there is nothing to pair")
+    tasks = {task for task, *_ in both}
+    if len(tasks) > 1 and any(task.reference is None for task in tasks):
+        raise OffbenchError(
+            "a dataset without reference scores has raw returns, which do not average with other datasets' scores; "
+            "give a --runs folder of one dataset"
+        )
+    pairs = [Pair(t.name, one.seed, one.score(t.reference), other.score(t.reference)) for t, one, other in both]
+    trained = [[one for _, one, _ in both], [other for *_, other in both]]
+    return Comparison(
+        groups[0][0].method.label,
+        groups[1][0].method.label,
+        pairs,
+        " and ".join(sorted({REFERENCES[task.reference] for task in tasks})),
+        paired(differences(both)),
+        improvement(_by_dataset(pairs, lambda pair: pair.a), _by_dataset(pairs, lambda pair: pair.b)),
+        sum(len(entry.runs) for group in groups for entry in group) - 2 * len(both),
+        (window_words(trained[0]), window_words(trained[1])),
+        comparable(both),
+        sum(t.state != "finished" for side in trained for t in side),
+    )
+
+
+Partners = Sequence[tuple[Task, Trained, Trained]]
+
+
+def partners(a: Iterable[Entry], b: Iterable[Entry]) -> Partners:
+    """Return the runs of A and of B that have the same dataset and seed, in order of A's."""
+    others = {(entry.task, trained.seed): trained for entry in b for trained in entry.runs}
+    mine = ((entry.task, trained) for entry in a for trained in entry.runs)
+    return [(task, one, others[task, one.seed]) for task, one in mine if (task, one.seed) in others]
+
+
+def comparable(both: Partners) -> bool:
+    """Return whether both runs of each pair are scored over evaluations at the same steps."""
+    return all(one.window == other.window for _, one, other in both)
+
+
+def differences(both: Partners) -> dict[str, list[float]]:
+    """Return {task: score of A's run minus score of B's, for each pair}."""
+    found: dict[str, list[float]] = {}
+    for task, one, other in both:
+        found.setdefault(task.name, []).append(one.score(task.reference) - other.score(task.reference))
+    return found
+
+
+def favoured(found: Paired) -> int:
+    """Return 1 if A is better, -1 if B is, 0 if there is no evidence: interval and sign-flip test must agree."""
+    low, high = found.difference.low, found.difference.high
+    if low is None or high is None or low <= 0 <= high or found.p > LEVEL:
+        return 0
+    return 1 if low > 0 else -1
+
+
+def _by_dataset(pairs: Iterable[Pair], value: Callable[[Pair], float]) -> dict[str, list[float]]:
+    found: dict[str, list[float]] = {}
+    for pair in pairs:
+        found.setdefault(pair.dataset, []).append(value(pair))
+    return found
+
+
+def select(results: Results, selector: str) -> list[Entry]:
+    """Return the entries that ALGO or ALGO/VARIANT names. Raises OffbenchError unless they are of one variant."""
+    algorithm, slash, variant = selector.partition("/")
+    known = [method for method in results.methods if method.algorithm == algorithm]
+    if not known:
+        here = {method.algorithm for method in results.methods}
+        if algorithm in algorithm_names():
+            raise OffbenchError(f"{algorithm} has no evaluated runs here; {', '.join(sorted(here))} have")
+        raise unknown("algorithm", algorithm, here)
+    variants = {method.variant: method for method in known}
+    labels = {method.label.partition(" ")[2]: method.variant for method in known}  # as tables say it: beta=adaptive
+    folders = {folder_name(name): name for name in variants}
+    variant = labels.get(variant, folders.get(variant, variant))
+    if not slash:
+        variant = next(iter(variants)) if len(variants) == 1 else "default"
+        if variant not in variants:
+            names = ", ".join(f"{algorithm}/{name}" for name in variants)
+            raise OffbenchError(f"{algorithm} has several variants: give one of {names}")
+    if variant not in variants:
+        raise unknown(f"variant of {algorithm}", variant, variants)
+    return results.of(variants[variant])

@@ -1,0 +1,316 @@
+"""Results: a folder of runs as tasks, methods and the scores of their seeds.
+
+    Task    a dataset: its id and its content; the reference that its scores are normalised by
+    Method  an algorithm and a variant
+    Entry   the evaluated runs of one method on one task: a cell of the score table
+
+Everything is read from the run directories alone.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offbench.common.errors import OffbenchError
+from offbench.common.scores import mean_std, normalize, run_return, window
+from offbench.common.text import counted, printable
+from offbench.data.levels import LEVELS
+from offbench.training.run import DIGITS, Run, find_runs
+
+# the order of the BDB paper's Table 1; levels are in its order already
+ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
+METHOD_ORDER = ("td3_bc", "cql", "bdb")
+REFERENCES = {"dataset": "own reference", "d4rl": "D4RL's constants", None: "no reference: raw return"}
+# Settings that make BDB another method than the paper's (in algos/bdb.py their help begins with "ours").
+OURS = {"uncertainty", "uncertainty_scale", "beta_max", "cloning_steps", "beta_target", "beta_learning_rate"}
+OURS |= {"critic_penalty", "penalty_weight", "penalty_actions"}
+
+
+@dataclass(frozen=True)
+class Task:
+    """A dataset that runs were trained on.
+
+    Attributes:
+        content: its content hash; the same id may have been recorded twice.
+        reference: what scores are normalised by: "dataset", "d4rl" or None (raw returns).
+        twin: whether another content goes by the same id.
+    """
+
+    dataset: str
+    content: str
+    reference: str | None
+    twin: bool = False
+
+    @property
+    def name(self) -> str:
+        """The dataset's id, with its content's first digits where the id alone is ambiguous."""
+        return f"{self.dataset} ({self.content[:DIGITS]})" if self.twin else self.dataset
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """(environment, level) by the dataset's id; the level is empty where the id has none."""
+        stem = re.sub(r"-v\d+$", "", self.dataset)
+        found = re.fullmatch(rf"(.+?)[-/]({'|'.join(sorted(LEVELS, key=len, reverse=True))}|\d+percent)", stem)
+        return (found[1].split("/")[-1], found[2]) if found else (stem, "")
+
+
+@dataclass(frozen=True)
+class Method:
+    """An algorithm with its settings.
+
+    Attributes:
+        beta: the value of a setting of that name, as the published tables' columns have it.
+    """
+
+    algorithm: str
+    variant: str
+    beta: str | None = None
+
+    @property
+    def label(self) -> str:
+        """What a table's column says, e.g. `bdb beta=0.25`."""
+        variant = "" if self.variant == "default" else self.variant
+        if self.beta is not None and not re.search(r"(^|,)beta=", variant):
+            variant = f"beta={self.beta},{variant}".rstrip(",")
+        return f"{self.algorithm} {variant}".strip()
+
+    @property
+    def published(self) -> str:
+        """The method's name in published/scores.csv; empty for what no paper has."""
+        if {part.partition("=")[0] for part in self.variant.split(",")} & OURS:
+            return ""
+        return self.algorithm if self.beta is None else f"{self.algorithm} beta={self.beta}"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One run and what has been evaluated of it."""
+
+    run: Run
+    config: Mapping[str, Any]
+    evaluations: Mapping[int, Sequence[tuple[float, int]]]
+
+    @property
+    def seed(self) -> int:
+        """The run's seed."""
+        return int(self.config["seed"])
+
+    @property
+    def window(self) -> tuple[int, ...]:
+        """The steps of the evaluations behind the run's score."""
+        return window(self.evaluations)
+
+    @property
+    def reached(self) -> int:
+        """The newest evaluated step."""
+        return max(self.evaluations)
+
+    @property
+    def steps(self) -> int:
+        """How far the run is to go."""
+        return int(self.config["steps"])
+
+    @property
+    def state(self) -> str:
+        """`finished`, `unfinished` or `diverged`."""
+        if self.run.diverged:
+            return "diverged"
+        return "finished" if self.reached >= self.steps else "unfinished"
+
+    def score(self, reference: str | None) -> float:
+        """Return the run's score by a reference that it has (None: its return)."""
+        return self._normalized(run_return(self.evaluations), reference)
+
+    def curve(self, reference: str | None) -> dict[int, float]:
+        """Return the score of each evaluation."""
+        means = {step: float(np.mean([ret for ret, _ in rows])) for step, rows in self.evaluations.items()}
+        return {step: self._normalized(mean, reference) for step, mean in means.items()}
+
+    def _normalized(self, value: float, reference: str | None) -> float:
+        return value if reference is None else normalize(value, *self.config["references"][reference])
+
+
+@dataclass(frozen=True)
+class Entry:
+    """The runs of one method on one task, in order of their seeds."""
+
+    task: Task
+    method: Method
+    runs: tuple[Trained, ...]
+
+    @property
+    def scores(self) -> list[float]:
+        """Each run's score by the task's reference."""
+        return [trained.score(self.task.reference) for trained in self.runs]
+
+    def mean_std(self, reference: str | None) -> tuple[float, float | None] | None:
+        """Return mean and deviation over seeds by a reference; None if a run lacks it."""
+        if reference is not None and not all(t.config["references"].get(reference) for t in self.runs):
+            return None
+        return mean_std([trained.score(reference) for trained in self.runs])
+
+    @property
+    def reached(self) -> int:
+        """The step that every run has been evaluated at or after."""
+        return min(trained.reached for trained in self.runs)
+
+    @property
+    def steps(self) -> int:
+        """How far the runs are to go."""
+        return max(trained.steps for trained in self.runs)
+
+    @property
+    def states(self) -> set[str]:
+        """How far the runs are: `finished`, `unfinished`, `diverged`."""
+        return {trained.state for trained in self.runs}
+
+    @property
+    def evaluations(self) -> int:
+        """The fewest evaluations behind a run's score."""
+        return min(len(trained.window) for trained in self.runs)
+
+    @property
+    def window(self) -> tuple[int, ...] | None:
+        """The steps of the evaluations behind the scores; None if the runs differ."""
+        windows = {trained.window for trained in self.runs}
+        return windows.pop() if len(windows) == 1 else None
+
+    def common_curve(self) -> tuple[list[int], np.ndarray[Any, Any]]:
+        """Return the steps that all runs were evaluated at, and their scores [runs, steps]."""
+        curves = [trained.curve(self.task.reference) for trained in self.runs]
+        steps = sorted(set.intersection(*(set(curve) for curve in curves)))
+        return steps, np.array([[curve[step] for step in steps] for curve in curves])
+
+
+@dataclass(frozen=True)
+class Results:
+    """All entries of a folder, tasks and methods in the order of the paper's table."""
+
+    root: Path
+    tasks: tuple[Task, ...]
+    methods: tuple[Method, ...]
+    entries: Mapping[tuple[Task, Method], Entry]
+    waiting: tuple[Run, ...]  # claimed, not yet evaluated
+
+    def of(self, method: Method) -> list[Entry]:
+        """Return a method's entries in order of tasks."""
+        return [self.entries[task, method] for task in self.tasks if (task, method) in self.entries]
+
+    def comparable(self, task: Task) -> bool:
+        """Return whether all scores of a task are of evaluations at the same steps: others must not be ranked."""
+        runs = [trained for (of, _), entry in self.entries.items() if of == task for trained in entry.runs]
+        return len({trained.window for trained in runs}) == 1
+
+    def scores(self, method: Method) -> dict[str, list[float]]:
+        """Return {task: normalised scores of its seeds}; tasks without a reference are left out."""
+        return {entry.task.name: entry.scores for entry in self.of(method) if entry.task.reference}
+
+
+def read_results(root: str | Path) -> Results:
+    """Read every run below a folder.
+
+    Raises:
+        OffbenchError: none is evaluated, or one is there twice. Damaged runs are named on stderr and left out.
+    """
+    entries, waiting = entries_of(find_runs(Path(root)))
+    if not entries:
+        raise OffbenchError(f"no evaluated runs below {root}; start one with `offbench train ALGO --dataset ID`")
+    tasks = dict.fromkeys(entry.task for entry in entries)
+    methods = sorted({entry.method for entry in entries}, key=_method_order)
+    return Results(Path(root), tuple(tasks), tuple(methods), {(e.task, e.method): e for e in entries}, tuple(waiting))
+
+
+def window_words(runs: Iterable[Trained]) -> str:
+    """Return which evaluations are behind the scores of runs: `10 evaluations, steps 5,000 to 50,000`."""
+    windows = [trained.window for trained in runs]
+    fewest, most = (len(f(windows, key=len)) for f in (min, max))
+    count = counted(most, "evaluation") if fewest == most else f"{fewest} to {most} evaluations"
+    first, last = min(found[0] for found in windows), max(found[-1] for found in windows)
+    return f"{count}, " + (f"step {last:,}" if first == last else f"steps {first:,} to {last:,}")
+
+
+def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
+    """Return runs as entries in the order of the paper's table, and the runs that have no evaluation yet.
+
+    Damaged runs are named on stderr and left out.
+
+    Raises:
+        OffbenchError: one is there twice, or none but damaged ones is evaluated.
+    """
+    groups: dict[tuple[str, str, str, str], list[Trained]] = {}
+    waiting = []
+    damaged: list[OffbenchError] = []
+    for run in runs:
+        try:
+            config, evaluations = run.config(), run.evaluations()
+        except OffbenchError as error:
+            damaged.append(error)
+            continue
+        if evaluations:
+            key = (config["dataset"], config["dataset_sha256"], config["algorithm"], config["variant"])
+            groups.setdefault(key, []).append(Trained(run, config, evaluations))
+        else:
+            waiting.append(run)
+    if damaged and not groups:
+        raise damaged[0]
+    for reason in damaged:
+        print(f"offbench: warning: left out: {printable(str(reason))}", file=sys.stderr)
+    tasks = _tasks(groups)
+    entries = []
+    for (dataset, content, algorithm, variant), group in groups.items():
+        group.sort(key=lambda trained: trained.seed)
+        _check_seeds(group)
+        method = Method(algorithm, variant, _beta(group[0].config["settings"].get("beta")))
+        entries.append(Entry(tasks[dataset, content], method, tuple(group)))
+    entries.sort(key=lambda entry: (_task_order(entry.task), _method_order(entry.method)))
+    return entries, waiting
+
+
+def _beta(value: Any) -> str | None:
+    if isinstance(value, int | float) and abs(value) < 1e6:
+        return f"{value:.2f}"
+    return None if value is None else str(value)  # what a damaged config.json or another's algorithm has there
+
+
+def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[Trained]]) -> dict[tuple[str, str], Task]:
+    """Return the task of each (dataset, content), with a reference that all its runs have."""
+    runs: dict[tuple[str, str], list[Trained]] = {}
+    for key, group in groups.items():
+        runs.setdefault(key[:2], []).extend(group)
+    ids = [dataset for dataset, _ in runs]
+    found = {}
+    for (dataset, content), group in runs.items():
+        known = [name for name in ("dataset", "d4rl") if all(t.config["references"].get(name) for t in group)]
+        found[dataset, content] = Task(dataset, content, known[0] if known else None, ids.count(dataset) > 1)
+    return found
+
+
+def _check_seeds(runs: Sequence[Trained]) -> None:
+    for one, other in itertools.pairwise(runs):
+        if one.seed == other.seed:
+            raise OffbenchError(
+                f"{one.run.folder} and {other.run.folder} are the same run twice: one seed counts once; "
+                "give a folder that holds each run once"
+            )
+
+
+def _rank(name: str, order: Sequence[str]) -> tuple[int, str]:
+    return (order.index(name) if name in order else len(order), name)
+
+
+def _task_order(task: Task) -> tuple[Any, ...]:
+    env, level = task.place
+    return _rank(level, tuple(LEVELS)), _rank(env, ENV_ORDER), task.dataset, task.content
+
+
+def _method_order(method: Method) -> tuple[Any, ...]:
+    # the fixed betas in order, then the words (adaptive)
+    return _rank(method.algorithm, METHOD_ORDER), method.beta or "", len(method.variant), method.variant

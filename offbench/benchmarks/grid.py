@@ -1,0 +1,154 @@
+"""Grids: which algorithms, settings and seeds on which datasets, for how long, in one TOML file.
+
+datasets = ["hopper-medium-v0", {id = "mine-v0", env = "./my-env.toml", level = "medium", steps = 20_000}]
+seeds = 5                          # that many, or a list
+steps = 1_000_000                  # with eval_every and eval_episodes as in `offbench train`
+[[algorithms]]
+name = "bdb"                       # then its settings; a list is a variant for each value (hidden: a list of lists)
+beta = [0.25, "adaptive"]
+steps = 500_000                    # seeds, steps, eval_every and eval_episodes of its own, if need be
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.resources
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from offbench.common.errors import OffbenchError, unknown
+from offbench.common.files import damage, read_text
+from offbench.common.settings import build, setting
+from offbench.data import minari_store
+from offbench.data.levels import parse_level
+from offbench.envs.recipes import load_recipe
+
+MOST_SEEDS = 100_000  # beyond this a count is a slip, and would fill the memory
+
+
+@dataclass(frozen=True)
+class Source:
+    """A dataset of a grid, and how it is recorded if it is missing.
+
+    Attributes:
+        env: a recipe's name or file (from the grid's folder if there is one, else from the current one); empty for a
+            dataset that offbench cannot record.
+    """
+
+    id: str
+    env: str = ""
+    level: str = ""
+    steps: int | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Times:
+    """How long runs train."""
+
+    seeds: tuple[int, ...] = (0,)
+    steps: int = setting(1_000_000, "updates", low=1)
+    eval_every: int = setting(5_000, "updates between evaluations", low=1)
+    eval_episodes: int = setting(10, "episodes of an evaluation", low=1)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An algorithm of a grid with its settings (lists are varied) and its times."""
+
+    algorithm: str
+    settings: Mapping[str, Any]
+    times: Times
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A whole benchmark."""
+
+    name: str
+    datasets: tuple[Source, ...]
+    entries: tuple[Entry, ...]
+
+
+def grids() -> Path:
+    """Return the folder of the shipped grids."""
+    return Path(str(importlib.resources.files("offbench"))) / "grids"
+
+
+def shipped_grids() -> list[str]:
+    """Return the names of the shipped grids."""
+    return sorted(path.stem for path in grids().glob("*.toml"))
+
+
+def load_grid(name: str) -> Grid:
+    """Return a shipped grid by name (`paper-small`) or anybody's by path (`./mine.toml`).
+
+    Raises:
+        OffbenchError: no such grid, not TOML, an unknown key, a wrong type or value.
+    """
+    own = name.endswith(".toml") or "/" in name
+    path = Path(name) if own else grids() / f"{name}.toml"
+    if not own and name not in shipped_grids():
+        raise unknown("grid", name, shipped_grids())
+    where = f"{path.name}"
+    try:
+        with damage(f"{where}: not a readable TOML file", "correct it, or name another"):
+            values = tomllib.loads(read_text(path))
+    except FileNotFoundError:
+        raise OffbenchError(f"no grid file {path}; shipped are {', '.join(shipped_grids())}") from None
+    sources = _list(values.pop("datasets", []), "datasets", where)
+    entries = _list(values.pop("algorithms", []), "algorithms", where)
+    times = _times(values, Times(), where)
+    return Grid(
+        path.stem,
+        tuple(_source(value, path.parent, where) for value in sources),
+        tuple(_entry(value, times, where) for value in entries),
+    )
+
+
+def _list(value: Any, key: str, where: str) -> list[Any]:
+    if not isinstance(value, list) or not value:
+        raise OffbenchError(f"{where}: {key} must be a list with at least one item")
+    return value
+
+
+def _times(values: dict[str, Any], default: Times, where: str) -> Times:
+    """Return `default` with what `values` says otherwise."""
+    whole = dataclasses.asdict(default) | values
+    seeds = whole.pop("seeds")
+    if isinstance(seeds, int) and not isinstance(seeds, bool) and 0 < seeds <= MOST_SEEDS:
+        seeds = range(seeds)
+    bad = not isinstance(seeds, Sequence) or any(type(s) is not int or s < 0 for s in seeds)
+    if bad or len(set(seeds)) != len(seeds) or not len(seeds):
+        raise OffbenchError(f"{where}: seeds must be a count or a list of different whole numbers, not {seeds!r}")
+    return build(Times, whole | {"seeds": tuple(seeds)}, where)
+
+
+def _source(value: Any, folder: Path, where: str) -> Source:
+    """Return a dataset from its id alone (a shipped recipe's level) or from a table; `folder` is the grid's."""
+    if isinstance(value, dict):
+        source = build(Source, value, f"{where}: datasets")
+        parse_level(source.level or "medium")
+        minari_store.check_id(source.id)
+        beside = folder / source.env
+        env = str(beside) if source.env.endswith(".toml") and beside.is_file() else source.env
+        return dataclasses.replace(source, env=env, level=source.level or ("medium" if env else ""))
+    if not isinstance(value, str):
+        raise OffbenchError(f"{where}: datasets must be ids or tables, not {value!r}")
+    env, level = minari_store.recorded_by(minari_store.check_id(value))
+    if env and value.rpartition("-v")[2] != str(load_recipe(env).version):
+        return Source(value)  # another version's, such as one of D4RL's: known if it is here, never recorded
+    return Source(value, env, level)
+
+
+def _entry(value: Any, times: Times, where: str) -> Entry:
+    if not isinstance(value, dict) or not isinstance(value.get("name"), str):
+        raise OffbenchError(f"{where}: each of [[algorithms]] needs a name")
+    own = {field.name for field in dataclasses.fields(Times)}
+    label = f"{where}: {value['name']}"
+    changed = _times({key: item for key, item in value.items() if key in own}, times, label)
+    settings = {key: item for key, item in value.items() if key not in own and key != "name"}
+    return Entry(value["name"], settings, changed)

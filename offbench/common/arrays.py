@@ -1,0 +1,23 @@
+"""The type of arrays, and a hash over named ones."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+
+
+def content_sha256(arrays: Mapping[str, Array], state: Mapping[str, Any]) -> str:
+    """Return a hash over named arrays and the JSON beside them, so that a flipped bit is no other number."""
+    plain = json.loads(json.dumps(state))  # as it will be read: tuples are lists, keys are text
+    content = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
+    for name in sorted(arrays):
+        content.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}".encode())
+        content.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return content.hexdigest()

@@ -1,0 +1,71 @@
+"""Checkpoints: safetensors with a JSON state beside the tensors, the newest two kept, nothing ever unpickled."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save
+
+from offbench.common.arrays import content_sha256
+from offbench.common.files import regular, write_bytes
+
+KEPT = 2
+_NAME = re.compile(r"checkpoint-(\d{9,})\.safetensors")
+
+State = dict[str, Any]
+
+
+def save_checkpoint(folder: Path, step: int, tensors: dict[str, torch.Tensor], state: State) -> None:
+    """Write checkpoint-<step>.safetensors, whole or not at all."""
+    whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    # one key, because safetensors writes several in any order, and a run's bytes should depend on the run alone
+    about = {**state, "sha256": _sha256(whole, state)}
+    data = save(whole, metadata={"offbench": json.dumps(about, sort_keys=True)})
+    write_bytes(folder / f"checkpoint-{step:09d}.safetensors", data)
+
+
+def steps(folder: Path) -> list[int]:
+    """Return the steps that have a checkpoint in `folder`, newest first."""
+    found = (_NAME.fullmatch(path.name) for path in folder.glob("checkpoint-*.safetensors"))
+    return sorted((int(match[1]) for match in found if match), reverse=True)
+
+
+def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], State] | None:
+    """Read one checkpoint; None (and a line on stderr) if it is damaged."""
+    path = folder / f"checkpoint-{step:09d}.safetensors"
+    try:
+        os.close(regular(path))  # safe_open would wait for a FIFO
+        with safe_open(path, framework="pt") as file:
+            state = json.loads((file.metadata() or {})["offbench"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if not isinstance(state, dict) or state.get("step") != step:
+            raise ValueError(f"it is not of step {step}")
+        recorded = state.pop("sha256", None)  # older files have none
+        if recorded is not None and recorded != _sha256(tensors, state):
+            raise ValueError("its content is not what was written (SHA-256)")
+        return tensors, state
+    except Exception as error:  # damaged bytes bring out any error of any parser
+        print(f"offbench: {path} is damaged ({error}); using the one before it", file=sys.stderr)
+        return None
+
+
+def _sha256(tensors: dict[str, torch.Tensor], state: State) -> str:
+    return content_sha256({name: tensor.numpy() for name, tensor in tensors.items()}, state)
+
+
+def load_newest(folder: Path) -> tuple[dict[str, torch.Tensor], State] | None:
+    """Read the newest checkpoint that is whole, or return None."""
+    return next((found for step in steps(folder) if (found := load_checkpoint(folder, step))), None)
+
+
+def keep_newest(folder: Path) -> None:
+    """Delete all but the newest checkpoints."""
+    for step in steps(folder)[KEPT:]:
+        (folder / f"checkpoint-{step:09d}.safetensors").unlink(missing_ok=True)

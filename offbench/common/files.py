@@ -1,0 +1,212 @@
+"""Files that are whole or absent: written aside, flushed to disk, then renamed into place."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import errno
+import hashlib
+import io
+import json
+import os
+import socket
+import stat
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from offbench.common.errors import OffbenchError
+
+# errno to remedy
+OPEN_FILES: dict[int | None, str] = dict.fromkeys((errno.EMFILE, errno.ENFILE), "raise the limit with `ulimit -n`")
+ORPHANS = 3.0  # seconds to wait for a lock: processes whose parent was killed notice it within one
+
+
+@contextlib.contextmanager
+def disk_errors(what: str) -> Iterator[None]:
+    """Turn the operating system's refusals (full disk, no permission) into one clear line."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, FileNotFoundError | BrokenPipeError):
+            raise
+        remedy = OPEN_FILES.get(error.errno, "free some room or choose another folder")
+        raise OffbenchError(f"cannot write {what}: {error.strerror or error}; {remedy}") from error
+
+
+@contextlib.contextmanager
+def sole(lock: Path, what: str, patience: float = ORPHANS) -> Iterator[None]:
+    """Hold a lock file for this process, so that no other does the same work.
+
+    Args:
+        lock: its path, a hidden name; beside it lies who holds it, for the other process to say.
+        what: what is held and how, e.g. "hopper-medium-v0 is being recorded".
+        patience: seconds to wait for another process to let go.
+
+    Raises:
+        OffbenchError: another process holds it; its process id and host are named.
+    """
+    lock = lock.absolute()
+    held, holder = FileLock(lock), lock.with_suffix(".holder")
+    with disk_errors(str(lock.parent)):
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            held.acquire(timeout=patience)
+        except Timeout:
+            raise OffbenchError(f"{what} by {_holder(holder)}; wait for it, or stop it") from None
+    try:
+        _held[lock] = lock.stat().st_ino  # no new file gets this number while the lock is open
+        with disk_errors(str(lock.parent)):
+            holder.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
+        yield
+    finally:
+        if _is_ours(lock):  # else the holder file is another process's
+            holder.unlink(missing_ok=True)
+        _held.pop(lock, None)
+        held.release()
+
+
+_held: dict[Path, int] = {}  # the locks of this process, and their inodes
+
+
+def _is_ours(lock: Path) -> bool:
+    try:
+        return lock.stat().st_ino == _held.get(lock)
+    except OSError:
+        return False
+
+
+def check_ownership(path: Path) -> None:
+    """Check, before a write, that the locks this process holds at or above `path` are still in place.
+
+    Raises:
+        OffbenchError: a folder was moved, deleted or replaced while its lock was held.
+    """
+    parents = path.absolute().parents
+    for lock in _held:
+        if lock.parent in parents and not _is_ours(lock):
+            raise OffbenchError(
+                f"{lock.parent} was moved, deleted or replaced while this process was writing to it; "
+                "nothing more is written: move it back and run the command again to resume, or start over"
+            )
+
+
+def _holder(path: Path) -> str:
+    try:
+        words = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        words = ""
+    return words if words.startswith("process ") and len(words) < 300 else "another process"
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Replace the content of `path`, or leave it as it was.
+
+    Raises:
+        OffbenchError: the disk refuses, or the folder is no longer the one that this process has locked.
+    """
+    check_ownership(path)
+    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with disk_errors(str(path)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with open(aside, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(aside, path)
+        except BaseException:
+            aside.unlink(missing_ok=True)
+            raise
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what killed processes left of files that they were writing in `folder`; call it under its lock."""
+    for leftover in folder.glob(".*.tmp"):
+        leftover.unlink(missing_ok=True)
+
+
+def output_file(path: str | Path) -> Path:
+    """Return the path of a file that a user asks for. Raises OffbenchError if its folder is not there."""
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise OffbenchError(f"cannot write {path}: there is no folder {path.parent}")
+    return path
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write `value` as indented JSON, whole or not at all."""
+    write_bytes(path, (json.dumps(value, indent=1, sort_keys=False, allow_nan=False) + "\n").encode())
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file. Raises OffbenchError if it is missing or damaged."""
+    try:
+        with damage(f"{path} is damaged or not JSON", "delete it to start over"):
+            found = json.loads(read_text(path))
+            json.dumps(found, ensure_ascii=False).encode()  # "\\ud800" is JSON, but no text to be shown or written
+            return found
+    except FileNotFoundError:
+        raise OffbenchError(f"no file {path}") from None
+
+
+def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
+    """Return a CSV file's content; floats keep every digit that matters."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue().encode()
+
+
+@contextlib.contextmanager
+def damage(what: str, remedy: str) -> Iterator[None]:
+    """Turn whatever a reader of a file from elsewhere raises into one line; a missing file is left to the caller.
+
+    Args:
+        what: the file, and what is wrong with it, e.g. "run/config.json is damaged".
+        remedy: what to do about it.
+    """
+    try:
+        yield
+    except (OffbenchError, FileNotFoundError):
+        raise
+    except Exception as error:  # damaged bytes bring out any error of any parser
+        raise OffbenchError(f"{what} ({error or type(error).__name__}); {remedy}") from error
+
+
+def regular(path: str | Path, flags: int = os.O_RDONLY) -> int:
+    """Open a file as `open` does (it is an `opener`), but none that never ends: no FIFO, device or folder.
+
+    Raises:
+        OSError: it is not a regular file, or cannot be opened.
+    """
+    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError("not a regular file")
+    return descriptor
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return the content of a regular file. Raises OSError."""
+    with open(path, "rb", opener=regular) as file:
+        return file.read()
+
+
+def read_text(path: Path) -> str:
+    """Return the UTF-8 text of a regular file. Raises OSError or ValueError."""
+    return read_bytes(path).decode("utf-8")
+
+
+def sha256(data: bytes) -> str:
+    """Return the hexadecimal SHA-256 of `data`."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def sha256_of(path: Path) -> str:
+    """Return the hexadecimal SHA-256 of a regular file, read in pieces."""
+    with open(path, "rb", opener=regular) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

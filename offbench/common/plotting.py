@@ -1,0 +1,44 @@
+"""Pictures: matplotlib without a screen, written whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from offbench.common.errors import OffbenchError
+from offbench.common.files import output_file, write_bytes
+
+FORMATS = ("png", "svg", "pdf")
+
+
+@contextlib.contextmanager
+def figure(panels: int = 1) -> Iterator[tuple[Any, list[Any]]]:
+    """Yield (figure, axes of each panel side by side)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(6.4 * panels, 4.0), layout="constrained")
+    FigureCanvasAgg(fig)
+    axes = [fig.add_subplot(1, panels, i + 1) for i in range(panels)]
+    for panel in axes:
+        panel.spines[["top", "right"]].set_visible(False)
+    yield fig, axes
+
+
+def picture_file(path: str | Path) -> Path:
+    """Return the path of a picture that a user asks for. Raises OffbenchError for an unknown ending, or no folder."""
+    path = Path(path)
+    if path.suffix.lstrip(".").lower() not in FORMATS:
+        raise OffbenchError(f"a picture's name must end in {', '.join('.' + f for f in FORMATS)}, not {path.name!r}")
+    return output_file(path)
+
+
+def save(fig: Any, path: Path) -> Path:
+    """Write a figure in the format of its name's ending."""
+    data = io.BytesIO()
+    fig.savefig(data, format=path.suffix.lstrip(".").lower(), dpi=150)
+    write_bytes(path, data.getvalue())
+    return path

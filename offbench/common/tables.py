@@ -1,0 +1,115 @@
+"""A table that is written once and printed as CSV, Markdown, LaTeX and HTML."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from offbench.common.files import csv_bytes
+from offbench.common.text import no_formula
+
+SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
+    "β": r"$\beta$",
+    "†": r"$\dagger$",
+    "‡": r"$\ddagger$",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    **{character: "\\" + character for character in "&%$#_{}"},
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell.
+
+    Attributes:
+        text: what it says.
+        value: what it sorts by, if that is not its text.
+        more: what belongs to the text (steps, seeds): in brackets after it, in small print in HTML.
+        below: a second line in small print (HTML only).
+        best: whether it is the best of its row, or otherwise to be marked.
+        detail: the id of the box that a click opens (HTML only).
+    """
+
+    text: str
+    value: float | None = None
+    below: str = ""
+    best: bool = False
+    detail: str = ""
+    more: str = ""
+
+    @property
+    def full(self) -> str:
+        """The text with what belongs to it."""
+        return f"{self.text} ({self.more})" if self.more else self.text
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with its title and the notes below it.
+
+    Attributes:
+        name: the stem of its files and its id in the page.
+        heads: how many leading columns name the row.
+        small: a second line of each column's header (HTML; in the other formats it follows the first in brackets).
+    """
+
+    name: str
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    notes: Sequence[str] = ()
+    heads: int = 1
+    small: Sequence[str] = field(default=())
+
+    def columns(self) -> list[str]:
+        """Return each column's whole header on one line."""
+        below = self.small or [""] * len(self.header)
+        return [f"{text} ({more})" if more else text for text, more in zip(self.header, below, strict=True)]
+
+    def csv(self) -> bytes:
+        """Return the table as CSV, text as shown."""
+        return csv_bytes(self.columns(), [[no_formula(cell.full) for cell in row] for row in self.rows])
+
+    def markdown(self) -> str:
+        """Return title, table and notes as Markdown; the best in bold."""
+        cells = [[f"**{_plain(c.full)}**" if c.best else _plain(c.full) for c in row] for row in self.rows]
+        lines = markdown([_plain(text) for text in self.columns()], cells)
+        notes = [line for note in self.notes for line in ("", _plain(note))]
+        return "\n".join([f"## {_plain(self.title)}", "", *lines, *notes]) + "\n"
+
+    def latex(self) -> str:
+        """Return the table as LaTeX (booktabs), the notes as comments; the best in bold."""
+        body = [[f"\\textbf{{{latex(c.full)}}}" if c.best else latex(c.full) for c in row] for row in self.rows]
+        lines = [" & ".join(row) + r" \\" for row in [[latex(text) for text in self.columns()], *body]]
+        spec = "l" * self.heads + "r" * (len(self.header) - self.heads)
+        notes = [f"% {' '.join(note.split())}" for note in (self.title, *self.notes)]
+        top = [*notes, f"\\begin{{tabular}}{{{spec}}}", r"\toprule", lines[0], r"\midrule"]
+        return "\n".join([*top, *lines[1:], r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+
+def files(table: Table) -> Mapping[str, bytes]:
+    """Return a table's files by their endings."""
+    return {"csv": table.csv(), "md": table.markdown().encode(), "tex": table.latex().encode()}
+
+
+def latex(text: str) -> str:
+    """Return text with everything escaped that LaTeX would take for a command."""
+    return "".join(SPECIAL.get(character, character) for character in text)
+
+
+def _plain(text: str) -> str:
+    """Return text that Markdown prints as it is."""
+    escaped = "".join("\\" + c if c in "\\`*_[]|#" else c for c in text)
+    return html.escape(escaped, quote=False).replace("\n", " ")
+
+
+def markdown(header: Sequence[str], cells: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a Markdown table."""
+    return ["| " + " | ".join(line) + " |" for line in [header, ["---"] * len(header), *cells]]

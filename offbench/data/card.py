@@ -1,0 +1,242 @@
+"""`card`: an environment's dataset card, from its ladder and its five recorded levels.
+
+    card.json   each level's statistics, the versions they hold for, and a content hash for each MuJoCo version
+    README.md   the same to read, with references, rungs and provenance
+    card.png    the learning curve and the histogram of returns of each level
+
+`collect` compares what it records at full size with the shipped card.json, so that everybody knows whether
+they hold the same data.
+"""
+
+from __future__ import annotations
+
+import csv
+import shlex
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offbench.agents.ladder import BEHAVIOUR, Ladder, find_ladder
+from offbench.common.errors import OffbenchError
+from offbench.common.files import read_json, write_bytes, write_json
+from offbench.common.provenance import versions
+from offbench.common.scores import normalize
+from offbench.common.tables import markdown
+from offbench.data import minari_store
+from offbench.data.levels import LEVELS, full_size
+from offbench.data.show import Summary, show
+from offbench.envs.recipes import Recipe, load_recipe
+
+DECIDE = ("mujoco", "gymnasium", "numpy")  # the packages whose versions can change what is recorded
+BINS = 50
+BLUE, RED = "#3b6ea5", "#c4443c"
+
+
+def card(env: str, out: str | Path | None = None, behaviour_dir: str | Path = BEHAVIOUR) -> Path:
+    """Write the card of an environment from its five recorded levels (seed 0, the recipe's size).
+
+    Args:
+        env: a shipped recipe's name, or a recipe file.
+        out: the folder of the card; default `<env>-card`.
+        behaviour_dir: where agents trained here live, for an environment whose agent is not shipped.
+
+    Returns:
+        The folder.
+
+    Raises:
+        OffbenchError: a level is missing or was recorded otherwise, or there is no ladder.
+    """
+    recipe = load_recipe(env)
+    ladder = find_ladder(recipe, Path(behaviour_dir))
+    if ladder is None:
+        raise OffbenchError(
+            f"{recipe.name} has no ladder to describe, shipped or in {behaviour_dir}; "
+            f"build one with `offbench behaviour {shlex.quote(env)}`, or give its --behaviour-dir"
+        )
+    own = [] if Path(behaviour_dir) == Path(BEHAVIOUR) else ["--behaviour-dir", str(behaviour_dir)]
+    collect = shlex.join(["offbench", "collect", env, *own])
+    levels = {level: _recorded(recipe, ladder, level, collect) for level in LEVELS}
+    facts = {level: _facts(recipe, summary) for level, summary in levels.items()}
+    means = [facts[level]["return"] for level in LEVELS]
+    if sorted(means) != means:
+        print(f"offbench: warning: the levels of {recipe.name} are out of order: {means}", file=sys.stderr)
+    folder = Path(out or f"{recipe.name}-card")
+    made = {name: versions()[name] for name in DECIDE}
+    _keep_hashes(recipe, facts, made["mujoco"])
+    write_json(folder / "card.json", {"format": "offbench-card-2", "versions": made, "levels": facts})
+    _draw(recipe, ladder, levels, folder / "card.png")
+    write_bytes(folder / "README.md", ("\n".join(_text(recipe, ladder, facts, made)) + "\n").encode())
+    return folder
+
+
+def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
+    """Return a line that says whether a level recorded at full size is the one on the shipped card.
+
+    None where the card says nothing of it: no card, or a level that is not one of the five.
+    """
+    path = recipe.folder / "card.json" if recipe.folder else None
+    if path is None or not path.exists():
+        return None
+    known = read_json(path)
+    if level not in known["levels"]:
+        return None
+    contents = known["levels"][level]["content_sha256"]
+    if content_sha256 in contents.values():
+        return "content equal to the dataset card's, bit for bit"
+    here = versions()["mujoco"]
+    made = known["versions"] | {"mujoco": here if here in contents else next(iter(contents))}
+    others = [f"{name} {version}" for name, version in made.items() if versions()[name] != version]
+    reason = f"made with {', '.join(others)}" if others else "made with the same versions: another processor or libm?"
+    return f"warning: content differs from the dataset card's, {reason}"
+
+
+def _keep_hashes(recipe: Recipe, facts: dict[str, dict[str, Any]], mujoco: str) -> None:
+    """Add to each level the content hashes that the shipped card has of other MuJoCo versions.
+
+    Its replay is what tells whether the shipped card is of the same ladder: no simulator has a part in it.
+    """
+    path = recipe.folder / "card.json" if recipe.folder else None
+    known = read_json(path)["levels"] if path is not None and path.exists() else {}
+    same = known and facts["medium-replay"]["content_sha256"] in known["medium-replay"]["content_sha256"].values()
+    for level, values in facts.items():
+        others = known[level]["content_sha256"] if same else {}
+        values["content_sha256"] = {mujoco: values["content_sha256"]} | {
+            v: c for v, c in others.items() if v != mujoco
+        }
+
+
+def _recorded(recipe: Recipe, ladder: Ladder, level: str, collect: str) -> Summary:
+    """Return a recorded level, checked to be what the card claims. `collect` is the command that records it."""
+    dataset_id = f"{recipe.name}-{level}-v{recipe.version}"
+    if dataset_id not in minari_store.local_ids():
+        raise OffbenchError(f"{dataset_id} is not recorded yet; first `{collect} --level {level}`")
+    found = show(dataset_id)
+    ours = minari_store.provenance(found.metadata)
+    parts = LEVELS[level]
+    size = full_size(parts, recipe.dataset_steps)
+    if parts[0].source == "replay":
+        size = int(ladder.info["medium_replay"]["transitions"])
+    same = ours.get("references") == ladder.info["references"] and ours.get("seed") == 0
+    if not same or int(found.lengths.sum()) != size:
+        raise OffbenchError(
+            f"{dataset_id} is not the level that is shipped (seed 0, {size:,.0f} transitions, this ladder); "
+            f"record it with `{collect} --level {level} --overwrite`"
+        )
+    return found
+
+
+def _facts(recipe: Recipe, found: Summary) -> dict[str, Any]:
+    meta, returns = found.metadata, np.asarray(found.returns)
+    mean = float(returns.mean())
+    d4rl = None
+    if recipe.d4rl_min is not None and recipe.d4rl_max is not None:
+        d4rl = round(normalize(mean, recipe.d4rl_min, recipe.d4rl_max), 2)
+    return {
+        "transitions": int(found.lengths.sum()),
+        "episodes": len(returns),
+        "return": round(mean, 2),
+        "std": round(float(returns.std()), 2),
+        "min": round(float(returns.min()), 2),
+        "max": round(float(returns.max()), 2),
+        "score": round(normalize(mean, float(meta["ref_min_score"]), float(meta["ref_max_score"])), 2) + 0.0,  # no -0
+        "d4rl_score": d4rl,
+        "terminated": round(found.terminated, 4),
+        "content_sha256": minari_store.provenance(meta)["content_sha256"],
+    }
+
+
+def _text(recipe: Recipe, ladder: Ladder, facts: Mapping[str, Any], made: Mapping[str, str]) -> Iterator[str]:
+    info, references = ladder.info, ladder.info["references"]
+    yield f"# {recipe.name}: {recipe.env_id}"
+    yield from ("", f"Made by `offbench card {recipe.name}`; the same numbers for programs: `card.json`.", "")
+    yield from ("![Learning curve of the behaviour agent; returns of each level](card.png)", "", "## Levels", "")
+    header = ["level", "transitions", "episodes", "mean return", "std", "min", "max"]
+    header += ["score (own ref.)", "score (D4RL ref.)", "episodes terminated"]
+    yield from markdown(header, [_cells(level, values) for level, values in facts.items()])
+    yield from ("", "Returns are per episode; std over episodes. An episode that the level's size cuts is truncated.")
+    yield from ("", "## References", "")
+    yield from markdown(
+        ["policy", "score", "mean return", "95% interval", "episodes"],
+        [
+            [name, score, f"{ref['return']:.1f}", f"{ref['low']:.1f} to {ref['high']:.1f}", str(ref["episodes"])]
+            for name, score, ref in (("random", "0", references["random"]), ("expert", "100", references["expert"]))
+        ],
+    )
+    yield from ("", "## Behaviour agent", "")
+    sac, where = info["sac"], info["hardware"]
+    links = f"every rung: `{ladder.folder}`"
+    if recipe.folder:
+        rungs = "[behaviour/ladder.csv](behaviour/ladder.csv)"
+        links = f"settings and why: [recipe.toml](recipe.toml); every rung: {rungs}"
+    yield (
+        f"Stable-Baselines3's SAC, seed {info['seed']}: {info['steps']:,} environment steps, "
+        f"{sac['gradient_steps']:g} gradient steps for each, {info['hours']:.1f} hours on one core "
+        f"({where['processor']}). Command: `{info['command']}`; {links}."
+    )
+    yield from (
+        "",
+        "Policies kept, by measured return of the sampling policy; `--level FRACTION` takes the nearest:",
+        "",
+    )
+    yield from markdown(
+        ["step", "mean return", "95% interval", "fraction of expert", "level"],
+        [
+            [f"{r.step:,}", f"{r.ret:.1f}", f"{r.low:.1f} to {r.high:.1f}", f"{ladder.fraction(r):.2f}", r.role]
+            for r in ladder.rungs
+        ],
+    )
+    yield from ("", "## Content", "")
+    others = ", ".join(f"{name} {version}" for name, version in made.items() if name != "mujoco")
+    yield f"SHA-256 over the arrays in episode order, for {others} and each MuJoCo version:"
+    yield ""
+    rows = [
+        [level, version, f"`{content}`"]
+        for level, v in facts.items()
+        for version, content in v["content_sha256"].items()
+    ]
+    yield from markdown(["level", "mujoco", "content"], rows)
+    yield from ("", "`offbench collect` says whether what it recorded is the same.")
+
+
+def _cells(level: str, values: Mapping[str, Any]) -> list[str]:
+    spread = [_short(values[key]) for key in ("return", "std", "min", "max", "score", "d4rl_score")]
+    return [
+        level,
+        f"{values['transitions']:,}",
+        f"{values['episodes']:,}",
+        *spread,
+        f"{100 * values['terminated']:.1f}%",
+    ]
+
+
+def _short(value: float | None) -> str:
+    return "-" if value is None else f"{round(value, 1) + 0.0:,.1f}"  # + 0.0: no -0.0
+
+
+def _draw(recipe: Recipe, ladder: Ladder, levels: Mapping[str, Summary], path: Path) -> None:
+    from offbench.common.plotting import figure, save
+
+    with open(ladder.folder / "ladder.csv", newline="", encoding="utf-8") as file:
+        rows = [{key: row[key] for key in ("step", "return", "deterministic_return")} for row in csv.DictReader(file)]
+    steps = [int(row["step"]) for row in rows]
+    with figure(2) as (fig, (left, right)):
+        for key, name, color in (("return", "sampled", BLUE), ("deterministic_return", "deterministic", "#9ab8d6")):
+            left.plot(steps, [float(row[key]) for row in rows], color=color, linewidth=1, label=name)
+        kept = ladder.rungs
+        left.plot([r.step for r in kept], [r.ret for r in kept], "o", markersize=4, color=RED, label="kept")
+        left.set(xlabel="environment steps", ylabel="return", title=f"SAC on {recipe.env_id}")
+        left.legend(frameon=False)
+        low = min(float(found.returns.min()) for found in levels.values())
+        high = max(float(found.returns.max()) for found in levels.values())
+        edges = np.linspace(low, high, BINS + 1)
+        for place, found in enumerate(levels.values()):
+            counts, _ = np.histogram(found.returns, edges)
+            # a square root, so that the few odd episodes are seen beside the many usual ones
+            right.stairs(place + 0.85 * np.sqrt(counts / counts.max()), edges, baseline=place, fill=True, color=BLUE)
+            right.plot([found.returns.mean()] * 2, [place, place + 0.85], color=RED, linewidth=1.2)
+        right.set_yticks(np.arange(len(levels)) + 0.3, list(levels))
+        right.set(xlabel="return", title="episodes by return (root scale; line: mean)")
+        save(fig, path)

@@ -1,0 +1,291 @@
+"""`collect`: from a level's name to a Minari dataset with its references and provenance."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from offbench.agents.ladder import BEHAVIOUR, MEDIUM, MEDIUM_AT_MOST, Ladder, Rung, find_ladder
+from offbench.agents.medium_replay import load_replay
+from offbench.common.errors import OffbenchError
+from offbench.common.files import sha256
+from offbench.common.processes import default_workers
+from offbench.common.progress import Progress, duration
+from offbench.common.provenance import versions
+from offbench.data import minari_store
+from offbench.data.card import compare
+from offbench.data.levels import Part, full_size, parse_level, parse_mix, shares
+from offbench.data.references import warn_other_references
+from offbench.envs.contact_margin import MARGIN, without_margin
+from offbench.envs.environments import make_env
+from offbench.envs.physics import model_of
+from offbench.envs.recipes import Recipe, load_recipe
+from offbench.rollouts.policy import Policy, uniform
+from offbench.rollouts.rollouts import Episode, Rollouts
+
+# What of the metadata makes two recordings the same one, with the versions that shape what an episode is.
+WHAT_IT_IS = ("env", "level", "seed", "recipe_sha256", "parts", "references")
+PHYSICS = ("mujoco", "gymnasium", "numpy")
+HOME = "https://github.com/offbench/offbench"
+
+
+def collect(
+    env: str,
+    level: str = "medium",
+    *,
+    mix: str | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    workers: int | None = None,
+    dataset_id: str | None = None,
+    overwrite: bool = False,
+    retrain: bool = False,
+    behaviour_dir: str | Path = BEHAVIOUR,
+) -> str:
+    """Record one level of one environment as a local Minari dataset.
+
+    Args:
+        env: a shipped recipe's name (`hopper`) or a recipe file (`./my-env.toml`).
+        level: random, medium, medium-replay, medium-expert, expert, or a fraction such as "0.6".
+        mix: a blend instead of a level, e.g. "random:0.5,expert:0.5".
+        steps: transitions; default: the recipe's (1,000,000 a part; medium-replay what training gave).
+        seed: of the recorded episodes. The same seed gives the same content for any number of workers.
+        workers: recording processes (default: one a core).
+        dataset_id: the Minari id; default `<env>-<level>-v<version>`.
+        overwrite: replace a dataset of that id. Without it, the same dataset recorded again is left as it is, and
+            another one is an error.
+        retrain: use a behaviour agent trained here instead of the shipped one.
+        behaviour_dir: where agents trained here live.
+
+    Returns:
+        The dataset's id, for `minari.load_dataset` or `offbench.load`.
+
+    Raises:
+        OffbenchError: anything that the user can mend, said in one line.
+    """
+    recipe = load_recipe(env)
+    name, parts = parse_mix(mix) if mix is not None else parse_level(level)
+    dataset_id = minari_store.check_id(dataset_id or f"{recipe.name}-{name}-v{recipe.version}")
+    if steps is not None and steps < 1:
+        raise OffbenchError(f"steps must be at least 1, not {steps}")
+    workers = default_workers(workers)
+
+    def prepared(ladder: Ladder) -> tuple[_Recording, list[Rung | None], list[int], dict[str, Any]]:
+        recording = _Recording(recipe, ladder, seed, workers)
+        sources = [recording.source(part) for part in parts]
+        counts = _counts(recipe, ladder, parts, steps)
+        return recording, sources, counts, _metadata(recording, dataset_id, mix or level, parts, sources, counts)
+
+    ladder = find_ladder(recipe, Path(behaviour_dir), retrain)
+    if ladder and not overwrite and minari_store.exists(dataset_id) and _is(dataset_id, prepared(ladder)[-1]):
+        minari_store.tidy(dataset_id)
+        print(f"offbench: {dataset_id} is recorded already, from the same policies and seed", file=sys.stderr)
+        return dataset_id
+    with minari_store.claimed(dataset_id, overwrite) as path:
+        ladder = ladder or _train(recipe, Path(behaviour_dir), workers)
+        recording, sources, counts, metadata = prepared(ladder)
+        total = sum(counts)
+        with Progress(total, f"recording {dataset_id}") as progress:
+            streams = (recording.episodes(*item) for item in zip(parts, sources, counts, itertools.count()))
+            episodes = _counted(itertools.chain.from_iterable(streams), progress)
+            content = minari_store.write(path, episodes, recording.spec, metadata, total, recording.spaces)
+    if seed == 0 and steps is None and not retrain and (said := compare(recipe, name, content)):
+        print(f"offbench: {said}", file=sys.stderr)
+    warn_other_references(recipe, ladder)
+    return dataset_id
+
+
+def _is(dataset_id: str, wanted: Mapping[str, Any]) -> bool:
+    """Return whether a dataset was recorded from what `wanted`, its metadata to be, says, on this physics."""
+    known, ours = (minari_store.provenance(found) for found in (minari_store.read_metadata(dataset_id), dict(wanted)))
+    ours = json.loads(json.dumps(ours))  # as it was written: tuples are lists
+    made = [{name: part.get("versions", {}).get(name) for name in PHYSICS} for part in (known, ours)]
+    return all(known.get(key) == ours[key] for key in WHAT_IT_IS) and made[0] == made[1]
+
+
+def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:
+    """Train the recipe's behaviour agent now."""
+    from offbench.agents.behaviour import behaviour
+
+    recipe.env_spec()  # refuses a bad environment before an hour is announced
+    gradient, steps = recipe.sac.steps * recipe.sac.gradient_steps, recipe.sac.steps
+    print(
+        f"offbench: {recipe.name} has no behaviour agent in {behaviour_dir} yet; training SAC for {steps:,} steps "
+        f"first, roughly {duration(gradient / 65 + steps / 4000)} on one core (it resumes if stopped)",
+        file=sys.stderr,
+    )
+    return behaviour(recipe, behaviour_dir=behaviour_dir, workers=workers)
+
+
+def _counts(recipe: Recipe, ladder: Ladder, parts: tuple[Part, ...], steps: int | None) -> list[int]:
+    """Return the transitions of each part; medium-replay alone is as long as training made it."""
+    available = int(ladder.info["medium_replay"]["transitions"])
+    if steps is None and len(parts) == 1 and parts[0].source == "replay":
+        return [available]
+    total = steps if steps is not None else full_size(parts, recipe.dataset_steps)
+    counts = shares(parts, total)
+    if 0 in counts:
+        raise OffbenchError(f"{total} steps leave a part of the blend without a transition; use more --steps")
+    for part, count in zip(parts, counts, strict=True):
+        if part.source == "replay" and count > available:
+            raise OffbenchError(
+                f"medium-replay of {recipe.name} has {available:,} transitions, not {count:,}; use fewer --steps"
+            )
+    return counts
+
+
+class _Recording:
+    """What all parts of one dataset share."""
+
+    def __init__(self, recipe: Recipe, ladder: Ladder, seed: int, workers: int) -> None:
+        self.recipe, self.ladder, self.seed, self.workers = recipe, ladder, seed, workers
+        self.spec = recipe.env_spec()
+        env = make_env(self.spec)
+        self.observation_space: Any = env.observation_space
+        self.action_space: Any = env.action_space
+        self.mujoco = model_of(env) is not None
+        env.close()
+
+    @property
+    def spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
+        """Of observations and actions."""
+        return self.observation_space, self.action_space
+
+    def source(self, part: Part) -> Rung | None:
+        """Return the rung a part is played by, or None for uniform actions and the replay."""
+        if part.source in ("uniform", "replay"):
+            return None
+        if part.source in ("medium", "expert"):
+            rung = self.ladder.role(part.source)
+            fraction = self.ladder.fraction(rung)
+            if part.source == "medium" and not MEDIUM <= fraction <= MEDIUM_AT_MOST:
+                remedy = "" if self.recipe.folder else "; a shorter [sac] segment in the recipe gives more rungs"
+                print(
+                    f"offbench: medium of {self.recipe.name} lies at {fraction:.2f} of the expert's return: "
+                    f"no rung of the training lies from {MEDIUM:.2f} to {MEDIUM_AT_MOST}{remedy}",
+                    file=sys.stderr,
+                )
+            return rung
+        rung = self.ladder.nearest(float(part.source))
+        print(
+            f"offbench: the rung nearest {part.source} is the one of step {rung.step:,}: return {rung.ret:.0f}, "
+            f"{self.ladder.fraction(rung):.2f} of the expert's",
+            file=sys.stderr,
+        )
+        return rung
+
+    def policy(self, rung: Rung | None) -> Policy:
+        """Return the policy that plays a part."""
+        if rung is not None:
+            return self.ladder.load(rung)
+        low, high = self.action_space.low, self.action_space.high
+        return uniform(low, high, self.observation_space.shape[0], self.recipe.env_id)
+
+    def episodes(self, part: Part, rung: Rung | None, count: int, index: int) -> Iterator[Episode]:
+        """Yield a part's episodes, exactly `count` transitions: the last one is cut."""
+        if part.source == "replay":
+            low, high = self.action_space.low, self.action_space.high
+            expected = self.ladder.info["medium_replay"]["sha256"]
+            yield from cut_at(
+                load_replay(self.ladder.replay, expected, low, high, self.observation_space.dtype), count
+            )
+            return
+        with Rollouts(self.spec, self.workers if self.workers > 1 else 0) as rollouts:
+            # the part is in the seed, so that both halves of medium-expert have their own episodes
+            endless = rollouts.episodes(self.policy(rung), self.seed, (index,), enough=count)
+            try:
+                yield from cut_at(endless, count)
+            finally:
+                endless.close()  # type: ignore[attr-defined]
+
+    def describe(self, part: Part, rung: Rung | None, count: int) -> dict[str, Any]:
+        """Return a part's definition as measured, for the metadata."""
+        known: dict[str, Any] = {"source": part.source, "transitions": count}
+        if part.source == "replay":
+            medium = self.ladder.info["levels"]["medium"]
+            return known | {"training_steps": medium, "sha256": self.ladder.info["medium_replay"]["sha256"]}
+        if rung is None:
+            random = self.ladder.info["references"]["random"]
+            return known | {"return": random["return"], "interval": [random["low"], random["high"]]}
+        return known | {
+            "rung": rung.step,
+            "return": rung.ret,
+            "interval": [rung.low, rung.high],
+            "episodes": rung.episodes,
+            "fraction": round(self.ladder.fraction(rung), 4),
+            "target": {"medium": [round(MEDIUM, 4), MEDIUM_AT_MOST], "expert": "best"}.get(part.source, part.source),
+            "policy_sha256": sha256((self.ladder.folder / "policies" / rung.policy).read_bytes()),
+        }
+
+
+def cut_at(episodes: Iterator[Episode], count: int) -> Iterator[Episode]:
+    """Yield episodes until they hold exactly `count` transitions; the last one is truncated where it must be."""
+    left = count
+    for episode in episodes:
+        yield episode.cut(left)
+        left -= min(left, len(episode))
+        if not left:
+            return
+
+
+def _counted(episodes: Iterator[Episode], progress: Progress) -> Iterator[Episode]:
+    for episode in episodes:
+        if not (np.isfinite(episode.observations).all() and np.isfinite(episode.rewards).all()):
+            raise OffbenchError("the environment gave NaN or infinite observations or rewards; nothing was kept")
+        yield episode
+        progress.to(progress.done + len(episode))
+
+
+def _metadata(
+    recording: _Recording,
+    dataset_id: str,
+    level: str,
+    parts: tuple[Part, ...],
+    sources: list[Rung | None],
+    counts: list[int],
+) -> dict[str, Any]:
+    """Return Minari's metadata, all of it, and ours under one key."""
+    recipe, ladder, made = recording.recipe, recording.ladder, versions()
+    described = [recording.describe(*item) for item in zip(parts, sources, counts, strict=True)]
+    references = ladder.info["references"]
+    uses = {
+        "uniform": "uniform-random actions",
+        "replay": "the replay of SAC's training up to its medium policy",
+    }
+    words = [
+        uses.get(p.source, f"SAC's policy of training step {r.step if r else 0}")
+        for p, r in zip(parts, sources, strict=True)
+    ]
+    return {
+        "dataset_id": dataset_id,
+        "minari_version": made["minari"],
+        "eval_env_spec": without_margin(recording.spec)[0],
+        "algorithm_name": "random" if all(p.source == "uniform" for p in parts) else "SAC (Stable-Baselines3)",
+        "author": {"offbench"},
+        "author_email": {"offbench@example.org"},
+        "code_permalink": f"{HOME}/tree/v{made['offbench']}",
+        "description": f"{recipe.env_id}, level {level}: {', then '.join(words)}. Recorded by offbench.",
+        "requirements": [f"mujoco=={made['mujoco']}", f"gymnasium=={made['gymnasium']}"],
+        "ref_min_score": references["random"]["return"],
+        "ref_max_score": references["expert"]["return"],
+        "num_episodes_average_score": int(references["expert"]["episodes"]),
+        minari_store.KEY: {
+            "format": "offbench-dataset-1",
+            "env": recipe.name,
+            "level": level,
+            "seed": recording.seed,
+            "recipe_sha256": recipe.sha256(),
+            "parts": described,
+            "references": references,
+            "d4rl": None if recipe.d4rl_min is None else [recipe.d4rl_min, recipe.d4rl_max],
+            MARGIN: recipe.contact_margin if recording.mujoco else None,
+            "versions": made,
+        },
+    }

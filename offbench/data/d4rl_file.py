@@ -1,0 +1,115 @@
+"""A D4RL file, opened and checked: its columns, and the metadata that `offbench export` left in it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+from gymnasium.envs.registration import EnvSpec
+from minari.serialization import deserialize_space
+
+from offbench.common.arrays import Array
+from offbench.common.errors import OffbenchError
+from offbench.data import minari_store
+
+COLUMNS = ("observations", "actions", "rewards", "terminals")
+OPTIONAL = ("timeouts", "next_observations", "infos/seed")
+MOST_COMPRESSED = 1000  # times smaller than its numbers: no honest file is
+
+
+@dataclass(frozen=True)
+class Source:
+    """An opened D4RL file, its columns checked."""
+
+    path: Path
+    columns: dict[str, h5py.Dataset]
+    about: dict[str, Any]  # what `offbench export` added: Minari's metadata
+
+    def __len__(self) -> int:
+        return len(self.columns["rewards"])
+
+    def read(self, name: str, first: int, end: int) -> Array:
+        """Return rows [first, end) of a column; rewards and flags flat."""
+        rows: Array = self.columns[name][first:end]
+        return rows.reshape(len(rows)) if rows.ndim == 2 and name not in _WIDE else rows
+
+
+_WIDE = ("observations", "actions", "next_observations")
+
+
+def read_source(path: Path, file: h5py.File) -> Source:
+    """Return an opened file's columns, checked. Raises OffbenchError if it is no D4RL file, or no honest one."""
+    columns = {}
+    for name in (*COLUMNS, *OPTIONAL):
+        found = _own(path, file, name)
+        if found is not None:
+            columns[name] = found
+        elif name in COLUMNS:
+            raise OffbenchError(f"{path} is no D4RL file: it has no {name}")
+    _check(path, columns)
+    return Source(path, columns, _about(path, file))
+
+
+def _own(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
+    """Return a column of the file itself, None if there is none.
+
+    Every link is looked at before it is followed: it may lead to any file of this machine.
+    """
+    found: Any = file
+    for part in name.split("/"):
+        link = found.get(part, getlink=True)
+        if link is None:
+            return None
+        if not isinstance(link, h5py.HardLink):
+            raise OffbenchError(f"{path}: {name} is not data of this file")
+        found = found[part]
+    if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+        raise OffbenchError(f"{path}: {name} is not data of this file")
+    return found
+
+
+def _check(path: Path, columns: dict[str, h5py.Dataset]) -> None:
+    """Refuse columns of other lengths, shapes and types, and those that claim more than the file can hold."""
+    rows = columns["observations"].shape[0] if columns["observations"].ndim == 2 else 0
+    if not rows:
+        raise OffbenchError(f"{path}: observations {columns['observations'].shape} are not rows of numbers")
+    for name, column in columns.items():
+        flat = column.shape in ((rows,), (rows, 1)) and name not in _WIDE
+        wide = column.ndim == 2 and column.shape[0] == rows and column.shape[1] > 0 and name in _WIDE
+        if not (flat or wide) or column.dtype.kind not in "fiub":
+            raise OffbenchError(f"{path}: {name} {column.shape} {column.dtype} does not fit {rows:,} rows")
+        if column.nbytes > MOST_COMPRESSED * (path.stat().st_size + 1000):
+            raise OffbenchError(f"{path}: {name} claims {column.nbytes / 1e9:.0f} GB, more than the file can hold")
+    if "next_observations" in columns and columns["next_observations"].shape != columns["observations"].shape:
+        raise OffbenchError(f"{path}: next_observations {columns['next_observations'].shape} differ from observations")
+
+
+def _about(path: Path, file: h5py.File) -> dict[str, Any]:
+    """Return the metadata that `offbench export` left in the file, checked; {} in anybody else's."""
+    text = file.attrs.get("offbench")
+    if text is None:
+        return {}
+    try:
+        about = json.loads(text)
+        known = {key: about[key] for key in (*_STRINGS, *_LISTS, *NUMBERS, minari_store.KEY) if key in about}
+        sound = all(isinstance(known.get(key, ""), str) for key in _STRINGS)
+        sound = sound and all(all(isinstance(item, str) for item in known.get(key, [])) for key in _LISTS)
+        sound = sound and all(math.isfinite(known.get(key, 0)) for key in NUMBERS)
+        if not sound or not isinstance(known.get(minari_store.KEY, {}), dict):
+            raise ValueError("a value of another type")
+        for key in ("env_spec", "eval_env_spec"):
+            if key in known:
+                EnvSpec.from_json(known[key])
+        kept = tuple(deserialize_space(known[key]) for key in ("observation_space", "action_space") if key in known)
+    except Exception as error:  # Gymnasium and Minari raise anything for JSON that is not theirs
+        raise OffbenchError(f"{path}: its offbench metadata are damaged ({error}); export the dataset again") from None
+    return known | {"spaces": kept}
+
+
+_STRINGS = ("env_spec", "eval_env_spec", "observation_space", "action_space", "algorithm_name", "description")
+_LISTS = ("author", "author_email", "requirements")
+NUMBERS = ("ref_min_score", "ref_max_score", "num_episodes_average_score")

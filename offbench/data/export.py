@@ -1,0 +1,208 @@
+"""`export`: a Minari dataset as a D4RL file, or as the arrays that D4RL's loader would make of it.
+
+d4rl   HDF5, the recorded numbers as they are: what D4RL's get_dataset reads, and with it CORL and the TD3+BC
+       author's code. Minari's metadata travel in the file's attributes, seeds in infos/seed: `import-d4rl` gives
+       the same dataset back.
+npz    float32, the keys of D4RL's qlearning_dataset: what their replay buffers take.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from minari.serialization import serialize_space
+
+from offbench.common.arrays import Array
+from offbench.common.errors import OffbenchError
+from offbench.common.files import disk_errors, output_file
+from offbench.common.hdf5_file import SafeFile, safe_file
+from offbench.common.progress import Progress
+from offbench.data import minari_store
+from offbench.data.minari_reader import episodes_of, open_minari
+from offbench.envs.environments import box
+
+FORMATS = {"d4rl": (".hdf5", ".h5"), "npz": (".npz",)}  # and how their files end
+TRAVELS = (  # Minari's metadata that go along
+    *("env_spec", "eval_env_spec", "algorithm_name", "description", "author", "author_email", "requirements"),
+    *("ref_min_score", "ref_max_score", "num_episodes_average_score", minari_store.KEY),
+)
+CHUNK = 16_384  # rows of a compressed piece
+PIECE = 1 << 20  # bytes copied at once
+ATTRIBUTE = 60_000  # bytes that HDF5 lets an attribute have
+
+Columns = dict[str, Array]
+
+
+def export(dataset_id: str, out: str | Path, *, style: str | None = None, drop_timeouts: bool = False) -> Path:
+    """Write a local Minari dataset with flat Box spaces to one file for other programs.
+
+    Args:
+        dataset_id: its id.
+        out: the file; what is there is replaced at the last moment.
+        style: d4rl or npz (default: as the file ends, .hdf5 or .npz).
+        drop_timeouts: npz only: leave out the steps at a timeout, as D4RL's qlearning_dataset does. (It also never
+            reads a file's very last row; one that terminates is kept here.)
+
+    Returns:
+        The file.
+
+    Raises:
+        OffbenchError: no such dataset, other spaces, damaged data, a file that ends otherwise than its format, no such
+            folder, or the disk refuses.
+    """
+    style = _style(Path(out), style)
+    if drop_timeouts and style == "d4rl":
+        raise OffbenchError("--drop-timeouts goes with --format npz: whoever reads a D4RL file drops them himself")
+    path, metadata, data = output_file(out), minari_store.read_metadata(dataset_id), open_minari(dataset_id)
+    for name in ("observation_space", "action_space"):
+        box(getattr(data, name), f"{dataset_id}: {name}")
+    with disk_errors(str(path)), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        aside = Path(folder) / path.name
+        with Progress(int(data.total_steps), f"exporting {dataset_id}") as progress:
+            columns = _columns(data, dataset_id, progress)
+            if style == "d4rl":
+                _write_d4rl(aside, columns, _about(data, metadata))
+            else:
+                dropped = minari_store.provenance(metadata).get("timeouts") == "dropped"
+                _write_npz(aside, (_float32(part) for part in columns), drop_timeouts, dropped)
+        with open(aside, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(aside, path)
+    return path
+
+
+def _style(out: Path, style: str | None) -> str:
+    """Return the format, asked for or as the file's name ends. Raises OffbenchError if the two do not fit."""
+    if style not in (None, *FORMATS):
+        raise OffbenchError(f"a format is one of {', '.join(FORMATS)}, not {style!r}")
+    found = next((name for name, endings in FORMATS.items() if out.suffix.lower() in endings), None)
+    if found is None or style not in (None, found):
+        wanted = " or ".join(ending for name in FORMATS if style in (None, name) for ending in FORMATS[name])
+        raise OffbenchError(f"cannot write {out.name!r}: {f'{style} files' if style else 'exports'} end in {wanted}")
+    return found
+
+
+def _columns(data: Any, dataset_id: str, progress: Progress) -> Iterator[Columns]:
+    """Yield the columns of one episode after another, checked to fit together."""
+    try:
+        for e in episodes_of(data):
+            steps = len(e)
+            shapes = [array.shape[:1] for array in e.arrays]
+            if (
+                not steps
+                or shapes != [(steps + 1,)] + [(steps,)] * 4
+                or e.actions.ndim != 2
+                or e.observations.ndim != 2
+            ):
+                raise OffbenchError(f"{dataset_id}, episode {e.index}: its arrays do not fit; see `offbench verify`")
+            yield {
+                "observations": e.observations[:-1],
+                "actions": e.actions,
+                "rewards": e.rewards,
+                "terminals": e.terminations.astype(bool),
+                "timeouts": e.truncations.astype(bool),
+                "next_observations": e.observations[1:],
+                "infos/seed": np.full(steps, -1 if e.seed is None else e.seed, np.int64),
+            }
+            progress.to(progress.done + steps)
+    except (KeyError, ValueError, RuntimeError) as error:
+        raise OffbenchError(f"{dataset_id} is damaged: {error}; record or download it again") from None
+
+
+def _about(data: Any, metadata: dict[str, Any]) -> str:
+    """Return the metadata that travel, as JSON."""
+    about = {key: metadata[key] for key in TRAVELS if metadata.get(key) is not None}
+    about |= {key: serialize_space(getattr(data, key)) for key in ("observation_space", "action_space")}
+    text = json.dumps(about)
+    if len(text.encode()) > ATTRIBUTE:
+        raise OffbenchError(f"{metadata.get('dataset_id')} has more metadata than a D4RL file can carry; shorten them")
+    return text
+
+
+def _write_d4rl(path: Path, parts: Iterator[Columns], about: str) -> None:
+    with safe_file(path) as disk, h5py.File(disk, "w") as file:
+        file.attrs["offbench"] = about
+        for rows in _blocks(parts):
+            disk.check()
+            for name, array in rows.items():
+                if name not in file:
+                    options = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+                    shape = (None, *array.shape[1:])
+                    chunks = (CHUNK, *array.shape[1:])
+                    file.create_dataset(
+                        name, (0, *array.shape[1:]), array.dtype, maxshape=shape, chunks=chunks, **options
+                    )
+                column = file[name]
+                column.resize(len(column) + len(array), axis=0)
+                column[-len(array) :] = array
+
+
+def _blocks(parts: Iterator[Columns]) -> Iterator[Columns]:
+    """Join episodes to blocks of at least CHUNK rows."""
+    waiting: list[Columns] = []
+    for part in parts:
+        waiting.append(part)
+        if sum(len(columns["rewards"]) for columns in waiting) >= CHUNK:
+            yield _joined(waiting)
+            waiting = []
+    if waiting:
+        yield _joined(waiting)
+
+
+def _joined(parts: list[Columns]) -> Columns:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _float32(part: Columns) -> Columns:
+    """Return what qlearning_dataset has of an episode: float32 numbers, boolean flags."""
+    numbers = ("observations", "actions", "rewards", "next_observations")
+    floats: Columns = {name: part[name].astype(np.float32) for name in numbers}
+    return floats | {name: part[name] for name in ("terminals", "timeouts")}
+
+
+def _write_npz(path: Path, parts: Iterator[Columns], drop_timeouts: bool, dropped: bool) -> None:
+    """Write the columns one by one to raw files, then zip them: no column is ever whole in memory.
+
+    Args:
+        dropped: an import has left out the steps at timeouts already; what is flagged now is the step before.
+    """
+    kinds: dict[str, tuple[Any, tuple[int, ...]]] = {}
+    count = 0
+    with contextlib.ExitStack() as stack:
+        raw: dict[str, SafeFile] = {}
+        for part in parts:
+            keep = np.ones(len(part["rewards"]), bool)
+            if drop_timeouts:
+                keep = ~part["timeouts"] | (dropped & ~part["terminals"])
+            for name, array in part.items():
+                if name not in raw:
+                    raw[name] = stack.enter_context(safe_file(path.with_name(f"{name}.raw")))
+                    kinds[name] = (array.dtype, array.shape[1:])
+                raw[name].write(np.ascontiguousarray(array[keep]).tobytes())
+                raw[name].check()
+            count += int(keep.sum())
+        disk = stack.enter_context(safe_file(path))
+        with zipfile.ZipFile(disk, "w") as archive:
+            for name, file in raw.items():
+                dtype, shape = kinds[name]
+                header = {
+                    "descr": np.lib.format.dtype_to_descr(dtype),
+                    "fortran_order": False,
+                    "shape": (count, *shape),
+                }
+                size = file.seek(0, os.SEEK_END)
+                file.seek(0)
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    np.lib.format.write_array_header_1_0(member, header)
+                    for first in range(0, size, PIECE):
+                        member.write(file.read(min(PIECE, size - first)))
+                        disk.check()

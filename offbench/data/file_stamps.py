@@ -1,0 +1,77 @@
+"""Whether files are still those that were read or written: by their stamps, and by their hashes where those differ."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from offbench.common.errors import OffbenchError
+from offbench.common.files import sha256_of
+from offbench.data import minari_store
+
+Stamps = dict[str, list[int]]
+
+
+class ReplacedError(OffbenchError):
+    """A dataset was replaced while it was read: what was read may be part the old one, part the new one."""
+
+
+@contextlib.contextmanager
+def unchanged(dataset_id: str) -> Iterator[Stamps]:
+    """Read a dataset within this context; yields the stamps of its files.
+
+    Raises:
+        ReplacedError: it was replaced meanwhile.
+    """
+    before = dataset_stamps(dataset_id)
+    words = f"{dataset_id} was replaced while it was read; wait until it is recorded, and run the command again"
+    try:
+        yield before
+    except (OffbenchError, OSError) as error:
+        if dataset_stamps(dataset_id) == before:
+            raise
+        raise ReplacedError(words) from error
+    if dataset_stamps(dataset_id) != before:
+        raise ReplacedError(words)
+
+
+def dataset_stamps(dataset_id: str) -> Stamps:
+    """Return the stamp of each file of a dataset by its name; {} if there is none, or it is being replaced."""
+    try:
+        folder = minari_store.path_of(dataset_id) / "data"
+        return {str(p.relative_to(folder)): stamp(p) for p in sorted(folder.rglob("*")) if p.is_file()}
+    except (OffbenchError, OSError):
+        return {}
+
+
+def stamp(path: Path) -> list[int]:
+    """Return what changes with a file's content. Its times can be set, but not when it was last touched (ctime)."""
+    found = path.stat()
+    return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
+
+
+def recorded(path: Path) -> tuple[str, list[int]]:
+    """Return a file's hash and the stamp it had before."""
+    before = stamp(path)
+    return sha256_of(path), before
+
+
+def checked(paths: Mapping[str, Path], written: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the hashes and stamps of files that are as recorded, with today's stamps.
+
+    A file with the recorded stamp has not been touched. Any other one, such as a copy, is hashed.
+
+    Raises:
+        ValueError: a file is missing, one too many, or not as recorded.
+    """
+    if paths.keys() != written.keys():
+        raise ValueError("other files")
+    found = dict(written)
+    for name, path in paths.items():
+        if stamp(path) != written[name][1]:
+            found[name] = list(recorded(path))
+            if found[name][0] != written[name][0]:
+                raise ValueError(f"{path} is not what was written")
+    return found

@@ -1,0 +1,100 @@
+"""Levels: what each kind of dataset is recorded from. A new level is one more entry in LEVELS."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from offbench.common.errors import OffbenchError, unknown
+
+
+@dataclass(frozen=True)
+class Part:
+    """A share of a dataset and where it comes from.
+
+    Attributes:
+        source: `uniform` actions, the `medium` or `expert` rung, the `replay` of training, or a fraction
+            such as "0.6" for the rung nearest to it.
+        weight: its transitions, as a multiple of the recipe's `dataset_steps`.
+    """
+
+    source: str
+    weight: float = 1.0
+
+
+LEVELS: dict[str, tuple[Part, ...]] = {  # in order of their mean return
+    "random": (Part("uniform"),),
+    "medium-replay": (Part("replay"),),
+    "medium": (Part("medium"),),
+    "medium-expert": (Part("medium"), Part("expert")),
+    "expert": (Part("expert"),),
+}
+SINGLE = {name: parts[0].source for name, parts in LEVELS.items() if len(parts) == 1}
+
+
+def parse_level(text: str) -> tuple[str, tuple[Part, ...]]:
+    """Return (name in a dataset id, parts) of a level's name or of a fraction such as `0.6`.
+
+    Raises:
+        OffbenchError: an unknown level, or a fraction outside (0, 1].
+    """
+    if text in LEVELS:
+        return text, LEVELS[text]
+    fraction = _number(text)
+    if fraction is None:
+        raise unknown("level", text, LEVELS)
+    if not 0 < fraction <= 1:
+        raise OffbenchError(f"a fraction for --level must lie above 0 and at most at 1, not {text}")
+    return f"{_percent(fraction)}percent", (Part(str(fraction)),)
+
+
+def parse_mix(text: str) -> tuple[str, tuple[Part, ...]]:
+    """Return (name, parts) of a blend such as `random:0.5,expert:0.5`; shares are of the recipe's steps.
+
+    Raises:
+        OffbenchError: not of that form, an unknown level, or shares that do not add up to 1.
+    """
+    names, parts = [], []
+    for item in text.split(","):
+        level, _, share = item.strip().partition(":")
+        weight = _number(share)
+        if weight is None or not 0 < weight <= 1:
+            raise OffbenchError(f"--mix takes LEVEL:SHARE,LEVEL:SHARE with shares in (0, 1], not {item.strip()!r}")
+        source = SINGLE.get(level)
+        if source is None:
+            name, (part, *rest) = parse_level(level)
+            if rest:
+                raise OffbenchError(f"--mix takes single levels; write {level} as its parts")
+            source = part.source
+        else:
+            name = level
+        names.append(f"{name}{_percent(weight)}")
+        parts.append(Part(source, weight))
+    total = sum(part.weight for part in parts)
+    if not math.isclose(total, 1, abs_tol=1e-6):
+        raise OffbenchError(f"the shares of --mix must add up to 1, not {total:g}")
+    return "-".join(names), tuple(parts)
+
+
+def full_size(parts: tuple[Part, ...], dataset_steps: int) -> int:
+    """Return the transitions of a level, `dataset_steps` being the recipe's of one part."""
+    return round(dataset_steps * sum(part.weight for part in parts))
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.6g}".replace(".", "p")
+
+
+def shares(parts: tuple[Part, ...], total: int) -> list[int]:
+    """Cut `total` transitions into the parts' shares; rounding goes to the last part."""
+    weights = [part.weight for part in parts]
+    cuts = [round(total * sum(weights[: i + 1]) / sum(weights)) for i in range(len(parts))]
+    return [end - start for start, end in zip([0, *cuts], cuts, strict=False)]

@@ -1,0 +1,343 @@
+"""Minari datasets on disk: written aside and renamed, so that an id never names half a dataset."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from filelock import FileLock, Timeout
+from gymnasium.envs.registration import EnvSpec
+
+from offbench.common.arrays import Array
+from offbench.common.errors import OffbenchError, nearest, unknown
+from offbench.common.files import disk_errors, read_json, sole
+from offbench.common.hdf5_file import SafeFile, safe_file
+from offbench.data.levels import parse_level
+from offbench.envs.contact_margin import ADDED, EARLIER, MARGIN, without_margin
+from offbench.envs.recipes import load_recipe, names
+from offbench.rollouts.rollouts import Episode
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.dataset.minari_storage import MinariStorage
+
+KEY = "offbench"  # under which all that Minari has no field for is kept in the metadata
+BYTES_PER_EPISODE = 14_000  # what HDF5 needs beside the numbers themselves, measured on short episodes
+
+
+def root() -> Path:
+    """Return Minari's folder: $MINARI_DATASETS_PATH, else ~/.minari/datasets."""
+    path = os.environ.get("MINARI_DATASETS_PATH")
+    return Path(path) if path else Path.home() / ".minari" / "datasets"
+
+
+def check_id(dataset_id: str) -> str:
+    """Return `dataset_id` if Minari can parse it: `name-v0` or `namespace/name-v0`."""
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError):
+        raise OffbenchError(
+            f"{dataset_id!r} is not a dataset id: use letters, digits, - and _, and end with -v0"
+        ) from None
+    return dataset_id
+
+
+def path_of(dataset_id: str) -> Path:
+    """Return the folder of a dataset id, whether it exists or not."""
+    return root() / check_id(dataset_id)
+
+
+def local_ids() -> list[str]:
+    """Return the ids of all local datasets, hidden folders and strays left out."""
+    base = root()
+    if not base.is_dir():
+        return []
+    found = (path.parent.parent.relative_to(base) for path in base.glob("**/data/metadata.json"))
+    return sorted(str(path) for path in found if not any(part.startswith(".") for part in path.parts))
+
+
+def recorded_by(dataset_id: str) -> tuple[str, str]:
+    """Return the shipped recipe and the `--level` that an id such as `hopper-60percent-v0` names, else ("", "")."""
+    body = dataset_id.rpartition("-v")[0]
+    for env in sorted(names(), key=len, reverse=True):
+        level = body.removeprefix(f"{env}-")
+        if level != body:
+            return env, _level(level)
+    return "", ""
+
+
+def _level(name: str) -> str:
+    """Return what `--level` takes for a level's name in an id: 60percent is 0.6."""
+    if name.endswith("percent"):
+        try:
+            return f"{float(name.removesuffix('percent').replace('p', '.')) / 100:g}"
+        except ValueError:
+            return name
+    return name
+
+
+def _absent(dataset_id: str) -> OffbenchError:
+    """Return the error for a dataset that is not here: how to record this very one, else the nearest that is here."""
+    env, level = recorded_by(dataset_id)
+    with contextlib.suppress(OffbenchError):  # no level
+        name = f"{env}-{parse_level(level)[0]}-v{load_recipe(env).version}"
+        command = f"`offbench collect {env} --level {level}`"
+        if name == dataset_id:
+            return OffbenchError(f"{dataset_id} is not recorded yet: {command}")
+        if not exists(name):
+            return OffbenchError(f"unknown dataset {dataset_id!r}: {command} records {name}")
+    with contextlib.suppress(OffbenchError):  # no id
+        if "/" in check_id(dataset_id):
+            return _not_downloaded(dataset_id)
+    said = str(unknown("dataset", dataset_id, local_ids()))
+    return OffbenchError(
+        f"{said}{' Or' if said.endswith('?') else ';'} record one: `offbench collect ENV --level LEVEL`"
+    )
+
+
+def _not_downloaded(dataset_id: str) -> OffbenchError:
+    """Return the error for an id with a namespace, as Minari's server has them (`mujoco/hopper/medium-v0`)."""
+    near = nearest(dataset_id, (known for known in local_ids() if "/" in known))
+    hint = f"did you mean {near!r}? Or download it" if near else "download it"
+    return OffbenchError(f"no local dataset {dataset_id!r}: {hint} with `minari download {dataset_id}`")
+
+
+def read_metadata(dataset_id: str) -> dict[str, Any]:
+    """Return a local dataset's metadata as Minari wrote it.
+
+    Raises:
+        OffbenchError: no such dataset (the nearest id is named), or its metadata are damaged.
+    """
+    path = root() / dataset_id / "data" / "metadata.json"
+    if not exists(dataset_id):
+        raise _absent(dataset_id)
+    metadata = read_json(path)
+    try:
+        _check_metadata(metadata)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise OffbenchError(f"{path} is damaged: {error}; record or download the dataset again") from None
+    return dict(metadata)
+
+
+TEXTS = ("env_spec", "eval_env_spec", "observation_space", "action_space", "algorithm_name", "description")
+NUMBERS = ("ref_min_score", "ref_max_score", "total_steps", "total_episodes")
+
+
+def _check_metadata(metadata: Any) -> None:
+    """Raise ValueError if a field that is read here is of another kind than it should be; all may be missing."""
+    if not isinstance(metadata, dict):
+        raise ValueError("not a table")
+    for key in (*TEXTS, *NUMBERS):
+        value = metadata.get(key)
+        number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e15
+        if value is not None and not (isinstance(value, str) if key in TEXTS else number):
+            raise ValueError(f"{key} is {str(value)[:40]!r}")
+    for key in ("env_spec", "eval_env_spec"):
+        spec = json.loads(metadata.get(key) or "null")
+        if spec is not None and not (isinstance(spec, dict) and isinstance(spec.get("id"), str)):
+            raise ValueError(f"{key} names no environment")
+    ours = metadata.get(KEY)
+    if ours is None:
+        return
+    kinds = {"versions": dict, "references": dict, "imported": dict, "parts": list, "content_sha256": str}
+    for key, kind in kinds.items():
+        if not isinstance(ours, dict) or not isinstance(ours.get(key, kind()), kind):
+            raise ValueError(f"{KEY}.{key} is of another kind")
+    if ours.get(MARGIN) not in (EARLIER, ADDED, None):
+        raise ValueError(f"{KEY}.{MARGIN} is {str(ours[MARGIN])[:40]!r}")
+    if not all(isinstance(part, dict) for part in ours.get("parts", [])):
+        raise ValueError(f"{KEY}.parts are of another kind")
+    if not all(isinstance(version, str) for version in ours.get("versions", {}).values()):
+        raise ValueError(f"{KEY}.versions are of another kind")
+
+
+def exists(dataset_id: str) -> bool:
+    """Return whether there is a local dataset of this id, sound or not."""
+    inside = not dataset_id.startswith((".", "/")) and ".." not in Path(dataset_id).parts and "\0" not in dataset_id
+    return inside and (root() / dataset_id / "data" / "metadata.json").exists()
+
+
+def provenance(metadata: dict[str, Any]) -> dict[str, Any]:
+    """Return what offbench recorded about a dataset ({} for others' datasets)."""
+    ours = metadata.get(KEY)
+    return ours if isinstance(ours, dict) else {}
+
+
+class ContentHash:
+    """SHA-256 over the arrays of episodes in order: the same for the same data, whatever file holds them."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+
+    def add(self, observations: Array, actions: Array, rewards: Array, ends: tuple[bool, bool]) -> None:
+        """Take in one episode; the arrays count with their dtype and shape."""
+        for array in (observations, actions, rewards):
+            self._hash.update(f"{array.dtype.str}{array.shape}".encode())
+            self._hash.update(np.ascontiguousarray(array).data)
+        self._hash.update(bytes(ends))
+
+    def hexdigest(self) -> str:
+        """Return the hash of all episodes so far."""
+        return self._hash.hexdigest()
+
+
+def being_recorded(dataset_id: str) -> bool:
+    """Whether another process holds a dataset id for writing."""
+    path = path_of(dataset_id)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(_lock_path(path))
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        return True
+    lock.release()
+    return False
+
+
+def _lock_path(path: Path) -> Path:
+    return path.parent / f".offbench-{path.name}.lock"
+
+
+@contextlib.contextmanager
+def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
+    """Hold a dataset id for writing; yields its folder.
+
+    Raises:
+        OffbenchError: the id is taken (and `overwrite` is not set), another process is recording it, or the
+            folder cannot be written.
+    """
+    path = path_of(dataset_id)
+    if not path.parent.resolve().is_relative_to(root().resolve()):
+        raise OffbenchError(f"{dataset_id} leads out of {root()} by a link; choose another id")
+    with sole(_lock_path(path), f"{dataset_id} is being recorded"):
+        with disk_errors(str(path)):
+            _recover(path)
+        if path.exists() and not overwrite:
+            known = f"{dataset_id} exists already{_size(dataset_id)}"
+            raise OffbenchError(f"{known}; use --overwrite to replace it, or --id for another id")
+        yield path
+
+
+def _size(dataset_id: str) -> str:
+    """Return a dataset's transitions in brackets, "" if its metadata do not say."""
+    try:
+        return f" ({read_metadata(dataset_id)['total_steps']:,} transitions)"
+    except (OffbenchError, KeyError, TypeError):
+        return ""
+
+
+def tidy(dataset_id: str) -> None:
+    """Delete what a killed process left beside a dataset, unless one is at work on it or the folder is read-only."""
+    path = path_of(dataset_id)
+    with contextlib.suppress(OffbenchError), sole(_lock_path(path), dataset_id, patience=0), disk_errors(str(path)):
+        _recover(path)
+
+
+def write(
+    path: Path,
+    episodes: Iterable[Episode],
+    spec: str,
+    metadata: dict[str, Any],
+    steps: int,
+    spaces: tuple[gym.Space[Any], gym.Space[Any]] | None = None,
+    expected: str | None = None,
+) -> str:
+    """Write episodes as a Minari HDF5 dataset at `path`, whole or not at all; return the content hash.
+
+    Args:
+        path: the folder of a claimed id; what is there is replaced at the last moment.
+        spec: the environment's EnvSpec as JSON.
+        metadata: Minari's fields; the content hash joins those under the key `offbench`.
+        steps: transitions to come, to see beforehand whether the disk has room.
+        spaces: of observations and actions, where the environment is not to be asked (it may be no longer there).
+        expected: the content hash to come, where it is known; any other content is refused.
+    """
+    env_spec = EnvSpec.from_json(without_margin(spec)[0])
+    aside = _partial(path)
+    with disk_errors(str(path)):
+        (aside / "data").mkdir(parents=True)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                storage = MinariStorage.new(aside / "data", *(spaces or (None, None)), env_spec, "hdf5")
+            _check_room(aside, storage, steps)
+            content, dtype = ContentHash(), storage.observation_space.dtype
+            with safe_file(storage._file_path) as storage._file_path:  # so that a full disk is no crash
+                storage.update_episodes(_buffers(episodes, dtype, content, storage._file_path))
+            if expected not in (None, content.hexdigest()):
+                raise OffbenchError(
+                    "the data are not those that were exported (their hash differs); export them again"
+                )
+            ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
+            storage.update_metadata(metadata | {KEY: ours})
+            if path.exists():
+                path.replace(_old(path))
+            aside.replace(path)
+        finally:
+            _recover(path)
+    return content.hexdigest()
+
+
+def _old(path: Path) -> Path:
+    """Return where the dataset that is being replaced waits for a moment."""
+    return path.with_name(f".offbench-{path.name}.old")
+
+
+def _partial(path: Path) -> Path:
+    """Return where the dataset is written until it is whole."""
+    return path.with_name(f".offbench-{path.name}.partial")
+
+
+def _recover(path: Path) -> None:
+    """Put the replaced dataset back if the new one did not make it, else delete it; delete what is half written."""
+    old = _old(path)
+    if old.exists() and not path.exists():
+        old.replace(path)
+    if old.is_symlink():
+        old.unlink()  # never what it leads to
+    for left in (old, _partial(path)):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _buffers(episodes: Iterable[Episode], dtype: Any, content: ContentHash, file: SafeFile) -> Iterator[EpisodeBuffer]:
+    for episode in episodes:
+        file.check()
+        observations = episode.observations.astype(dtype, copy=False)
+        ends = (episode.terminated, episode.truncated)
+        content.add(observations, episode.actions, episode.rewards, ends)
+        flags = np.zeros((2, len(episode)), bool)
+        flags[:, -1] = ends
+        yield EpisodeBuffer(
+            id=None,
+            seed=episode.seed if episode.seed >= 0 else None,
+            observations=observations,
+            actions=episode.actions,
+            rewards=episode.rewards,
+            terminations=flags[0],
+            truncations=flags[1],
+            infos=None,
+        )
+
+
+def _check_room(folder: Path, storage: Any, steps: int) -> None:
+    """Refuse to begin what the disk cannot hold (episodes of 100 steps assumed)."""
+    width = storage.observation_space.shape[0] * storage.observation_space.dtype.itemsize
+    width += storage.action_space.shape[0] * 4 + 10
+    need = steps * width + steps // 100 * BYTES_PER_EPISODE
+    free = shutil.disk_usage(folder).free
+    if free < need:
+        raise OffbenchError(
+            f"not enough room in {root()}: {need / 1e6:.0f} MB needed, {free / 1e6:.0f} MB free; "
+            "free some, set MINARI_DATASETS_PATH to another disk, or record fewer --steps"
+        )

@@ -1,0 +1,108 @@
+"""The environment that a dataset belongs to: its EnvSpec, and the rule for contact margins it was recorded under."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from offbench.common.errors import OffbenchError
+from offbench.common.provenance import versions
+from offbench.data import minari_store
+from offbench.envs import environments
+from offbench.envs.contact_margin import ADDED, EARLIER, MARGIN, SINCE, with_margin
+from offbench.envs.environments import believed_env
+from offbench.envs.recipes import load_recipe, names
+
+CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d+)(?:\.(\d+))?")  # of a requirement: `>=3.1.0,<3.2.0` has two
+
+
+def make_env(name: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
+    """Make a dataset's environment, or a recipe's, with the same physics on every MuJoCo version.
+
+    Args:
+        name: the id of a local dataset, a shipped recipe's name (`hopper`) or a recipe file (`./my-env.toml`).
+        render_mode: as `gymnasium.make` has it.
+
+    Raises:
+        OffbenchError: there is no such dataset or recipe, it names no environment, or that cannot be made.
+    """
+    if name in names() or Path(name).suffix == ".toml":
+        return environments.make_env(load_recipe(name).env_spec(), render_mode)
+    metadata = minari_store.read_metadata(name)
+    spec = evaluation_spec(metadata)
+    if spec is None:
+        raise OffbenchError(f"{name} names no environment; give the name or the file of a recipe instead")
+    believed_env(spec, name).close()
+    say_margin(name, metadata, spec)
+    return environments.make_env(spec, render_mode)
+
+
+def evaluation_spec(metadata: dict[str, Any]) -> str | None:
+    """Return the environment to evaluate a dataset's policies in, as EnvSpec JSON; None if it names none."""
+    spec = metadata.get("eval_env_spec") or metadata.get("env_spec")
+    return with_margin(spec, recorded_margin(metadata) or EARLIER) if spec else None
+
+
+def recorded_margin(metadata: dict[str, Any]) -> str | None:
+    """Return the rule for contact margins that a dataset was recorded under; None if its metadata do not tell."""
+    ours = minari_store.provenance(metadata)
+    if MARGIN in ours or "versions" in ours:  # recorded by offbench, which kept the earlier rule before it noted it
+        return str(ours.get(MARGIN) or EARLIER)
+    for operator, major, minor in _demands(metadata):
+        version = (int(major), int(minor or 0))
+        if operator in ("==", "~=", ">=", ">") and version >= (3, 5):
+            return ADDED
+        if (operator in ("==", "<=") and version < (3, 5)) or (operator == "<" and version <= (3, 5)):
+            return EARLIER
+    return None
+
+
+def _demands(metadata: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return (operator, major, minor) of each demand that Minari's requirements make on MuJoCo's version."""
+    listed = metadata.get("requirements")
+    ours = (
+        [str(item) for item in listed if re.match(r"\s*mujoco\b(?!-)", str(item))] if isinstance(listed, list) else []
+    )
+    return [clause for item in ours for clause in CLAUSE.findall(item)]
+
+
+def recorded_mujoco(metadata: dict[str, Any]) -> str | None:
+    """Return the MuJoCo version a dataset was recorded with: ours, or what a requirement pins; None if unknown."""
+    made = minari_store.provenance(metadata).get("versions")
+    if isinstance(made, dict) and "mujoco" in made:
+        return str(made["mujoco"])
+    listed = metadata.get("requirements")
+    for requirement in listed if isinstance(listed, list) else []:
+        pinned = re.fullmatch(r"mujoco\s*==\s*([\w.]+)", str(requirement))
+        if pinned:
+            return pinned[1]
+    return None
+
+
+def margins_matter(spec: str) -> bool:
+    """Return whether the rule for contact margins makes a difference in an environment (EnvSpec JSON)."""
+    from offbench.envs.physics import has_margins, model_of  # imports MuJoCo, which is slow to load
+
+    env = environments.make_env(spec)
+    model = model_of(env)
+    env.close()
+    return model is not None and has_margins(model)
+
+
+def say_margin(dataset_id: str, metadata: dict[str, Any], spec: str) -> None:
+    """Say which rule a dataset's environment (EnvSpec JSON) is made with, where that is not plain."""
+    rule = recorded_margin(metadata)
+    if rule == EARLIER or not margins_matter(spec):
+        return
+    words = (
+        f"{dataset_id}: contact margins as in MuJoCo {SINCE[rule or EARLIER]} (installed is {versions()['mujoco']})"
+    )
+    if rule is None:
+        words += f"; its metadata do not tell, `offbench verify {dataset_id}` finds out"
+    else:
+        words += ", which recorded it"
+    print(f"offbench: {words}", file=sys.stderr)

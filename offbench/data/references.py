@@ -1,0 +1,37 @@
+"""What datasets are taken for: by a grid, and beside the other datasets of their environment."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from typing import Any
+
+from offbench.agents.ladder import Ladder
+from offbench.common.errors import OffbenchError
+from offbench.data import minari_store
+from offbench.envs.recipes import Recipe
+
+
+def warn_other_references(recipe: Recipe, ladder: Ladder) -> None:
+    """Say which datasets of an environment were recorded with other references than its ladder has now."""
+    wanted = _scale(ladder.info["references"])
+    others = []
+    for dataset_id in minari_store.local_ids():
+        with contextlib.suppress(OffbenchError):
+            ours = minari_store.provenance(minari_store.read_metadata(dataset_id))
+            if ours.get("env") == recipe.name and _scale(ours.get("references")) not in (None, wanted):
+                others.append(dataset_id)
+    if others:
+        print(
+            f"offbench: warning: scores of {recipe.name} are now from {ladder.random_return:.1f} to "
+            f"{ladder.expert_return:.1f}; recorded with other references, so not to be compared with: "
+            f"{', '.join(others)}; record them again with --overwrite",
+            file=sys.stderr,
+        )
+
+
+def _scale(references: Any) -> list[float] | None:
+    try:
+        return [references[name]["return"] for name in ("random", "expert")]
+    except (KeyError, TypeError):
+        return None

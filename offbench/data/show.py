@@ -1,0 +1,98 @@
+"""`list` and `show`: what is here, and what is in a dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offbench.common.arrays import Array
+from offbench.common.errors import OffbenchError
+from offbench.common.scores import normalize
+from offbench.data import minari_store
+
+BINS = 12
+BAR = 40
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What is in a dataset: `lines()` for a terminal, `plot(path)` for a picture."""
+
+    dataset_id: str
+    metadata: dict[str, Any]
+    returns: Array
+    lengths: Array
+    terminated: float
+
+    def lines(self) -> list[str]:
+        """Return spaces, episodes, a histogram of returns and the provenance as text."""
+        ours, meta = minari_store.provenance(self.metadata), self.metadata
+        low, high = meta.get("ref_min_score"), meta.get("ref_max_score")
+        lines = [
+            f"{self.dataset_id}: {meta.get('description', 'no description')}",
+            f"spaces       observations {_space(meta, 'observation_space')}, actions {_space(meta, 'action_space')}",
+            f"episodes     {len(self.returns):,}, {int(self.lengths.sum()):,} transitions, "
+            f"length {self.lengths.mean():.0f} ({self.lengths.min()} to {self.lengths.max()}), "
+            f"{100 * self.terminated:.0f}% terminated",
+            f"return       mean {self.returns.mean():.1f}, std {self.returns.std():.1f}, "
+            f"{self.returns.min():.1f} to {self.returns.max():.1f}",
+        ]
+        if low is not None and high is not None and high > low:
+            score = normalize(float(self.returns.mean()), float(low), float(high))
+            lines.append(f"references   random {low:.1f}, expert {high:.1f}: normalized mean return {score:.1f}")
+        lines += ["", *_histogram(self.returns), ""]
+        for part in ours.get("parts", []):
+            words = ", ".join(f"{key} {value}" for key, value in part.items())
+            lines.append(f"made from    {words}")
+        made = ", ".join(f"{name} {version}" for name, version in ours.get("versions", {}).items())
+        told = {"seed": ours.get("seed"), "versions": made or None, "content": ours.get("content_sha256")}
+        told["imported"] = ours.get("imported", {}).get("file")
+        return lines + [f"{key:<12} {value}" for key, value in told.items() if value is not None]
+
+    def plot(self, path: str | Path) -> Path:
+        """Draw the histogram of returns. Raises OffbenchError if the picture cannot be written."""
+        from offbench.common.plotting import figure, picture_file, save
+
+        path = picture_file(path)
+        with figure() as (fig, (axes,)):
+            axes.hist(self.returns, bins=40, color="#3b6ea5")
+            axes.axvline(self.returns.mean(), color="#c44", linewidth=1.2, label=f"mean {self.returns.mean():.0f}")
+            axes.set(xlabel="return", ylabel="episodes", title=self.dataset_id)
+            axes.legend(frameon=False)
+            return save(fig, path)
+
+
+def show(dataset_id: str) -> Summary:
+    """Summarise a local Minari dataset with Box spaces.
+
+    Raises:
+        OffbenchError: no such dataset, or it cannot be read.
+    """
+    from offbench.data import transitions
+
+    data = transitions.load(dataset_id)
+    lengths = np.diff(data.ends, prepend=0)
+    terminated = float((data.masks[data.ends - 1] == 0).mean())
+    return Summary(dataset_id, data.metadata, np.asarray(data.returns), lengths, terminated)
+
+
+def _space(metadata: dict[str, Any], key: str) -> str:
+    import json
+
+    try:
+        space = json.loads(metadata[key])
+        return f"{space['type']} {tuple(space['shape'])} {space['dtype']}"
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return "unknown"
+
+
+def _histogram(values: Array) -> list[str]:
+    """Return a histogram as lines of text."""
+    if not len(values):
+        raise OffbenchError("the dataset has no episodes")
+    counts, edges = np.histogram(values, BINS)
+    bars = ["█" * round(BAR * count / counts.max()) for count in counts]
+    return [f"{edges[i]:>10.1f} to {edges[i + 1]:>9.1f}  {bars[i]:<{BAR}} {counts[i]:,}".rstrip() for i in range(BINS)]

@@ -1,0 +1,297 @@
+"""Transitions: any Minari dataset with Box spaces as flat float32 arrays, converted once and then mapped.
+
+episode 0: o o o o      observations [N + E, obs]   every episode's T + 1 rows, end to end
+episode 1: o o o        rows [N]                    the row of each transition's observation
+           s s s.       next observation = row + 1  so nothing is stored twice
+
+actions [N, act] in [-1, 1]   rewards [N]   masks [N] = 1 - terminations   ends [E]: transitions up to each
+episode's end   returns [E]
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from filelock import FileLock, Timeout
+
+from offbench.common.arrays import Array
+from offbench.common.errors import OffbenchError
+from offbench.common.files import disk_errors, read_text, write_json
+from offbench.common.progress import Progress
+from offbench.data import minari_store
+from offbench.data.file_stamps import ReplacedError, Stamps, checked, recorded, unchanged
+from offbench.data.minari_reader import check_storage, open_parsed
+from offbench.data.recorded_env import evaluation_spec
+from offbench.envs.environments import box
+
+ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
+ATTEMPTS = 3  # to read a dataset that is replaced meanwhile
+CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding are worth a warning
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """A dataset as flat arrays, mapped from the cache (see the module's drawing)."""
+
+    dataset_id: str
+    content: str  # SHA-256 over the arrays, the same as in an offbench dataset's metadata
+    observations: Array
+    rows: Array
+    actions: Array
+    rewards: Array
+    masks: Array
+    ends: Array
+    returns: Array
+    low: Array
+    high: Array
+    metadata: dict[str, Any]
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    @property
+    def env_spec(self) -> str | None:
+        """The environment to evaluate in, as EnvSpec JSON; None if the dataset does not name one."""
+        return evaluation_spec(self.metadata)
+
+    @property
+    def env_id(self) -> str:
+        """The environment's id, for the policy file; empty if the dataset does not name one."""
+        return str(json.loads(self.env_spec).get("id", "")) if self.env_spec else ""
+
+    @property
+    def references(self) -> tuple[float, float] | None:
+        """The dataset's own reference returns (random, expert); None if it has none."""
+        low, high = self.metadata.get("ref_min_score"), self.metadata.get("ref_max_score")
+        if low is None or high is None or not float(high) > float(low):
+            return None
+        return float(low), float(high)
+
+    def best(self, share: float) -> Array:
+        """Return the indices of the transitions of the best `share` of all episodes by return, in order."""
+        count = max(1, round(share * len(self.ends)))
+        lengths = np.diff(self.ends, prepend=0)
+        chosen = np.zeros(len(self.ends), bool)
+        chosen[np.argsort(-self.returns, kind="stable")[:count]] = True
+        return np.flatnonzero(np.repeat(chosen, lengths))
+
+    def normalizer(self) -> tuple[Array, Array]:
+        """Return mean and std + 1e-3 of the transitions' observations, [obs] float32, as TD3+BC's authors do."""
+        count, dim = len(self), self.observations.shape[1]
+        total, square = np.zeros(dim), np.zeros(dim)
+        for first in range(0, count, 100_000):
+            part = self.observations[self.rows[first : first + 100_000]].astype(np.float64)
+            total += part.sum(0)
+        mean = total / count
+        for first in range(0, count, 100_000):
+            part = self.observations[self.rows[first : first + 100_000]].astype(np.float64)
+            square += ((part - mean) ** 2).sum(0)
+        return mean.astype(np.float32), (np.sqrt(square / count) + 1e-3).astype(np.float32)
+
+
+def load(dataset_id: str) -> Transitions:
+    """Return a local Minari dataset as flat arrays.
+
+    Raises:
+        OffbenchError: no such dataset, spaces other than flat Boxes, NaN or infinite numbers, wrong shapes,
+            damaged files, data that are not those of the recorded hash.
+    """
+    for _ in range(ATTEMPTS - 1):
+        with contextlib.suppress(ReplacedError), unchanged(dataset_id) as stamps:
+            return _load(dataset_id, stamps)
+    with unchanged(dataset_id) as stamps:
+        return _load(dataset_id, stamps)
+
+
+def _load(dataset_id: str, stamps: Stamps) -> Transitions:
+    metadata = minari_store.read_metadata(dataset_id)
+    data = open_parsed(dataset_id)
+    observation_space = box(data.observation_space, f"{dataset_id}: observations")
+    action_space = box(data.action_space, f"{dataset_id}: actions")
+    if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
+        raise OffbenchError(f"{dataset_id}: the action space must be bounded to be scaled, not {action_space}")
+    folder = cache() / _key(dataset_id, metadata)
+    sources = {f"data/{name}": minari_store.path_of(dataset_id) / "data" / name for name in stamps}
+    found = _mapped(folder, sources)
+    if found is None:
+        with disk_errors(str(folder)):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            with FileLock(folder.with_name(f"{folder.name}.lock")):
+                found = _mapped(folder, sources)  # another process may have converted it meanwhile
+                if found is None:
+                    with unchanged(dataset_id):
+                        aside = _convert(data, dataset_id, observation_space, action_space, folder, sources)
+                    aside.replace(folder)
+                    found = _mapped(folder, sources)
+    if found is None:
+        raise OffbenchError(f"cannot read back {folder}; delete it and try again")
+    content, arrays = found
+    if minari_store.provenance(metadata).get("content_sha256", content) != content:
+        raise OffbenchError(
+            f"{dataset_id} is damaged: its arrays are not those of the content_sha256 in its metadata; "
+            "record or download it again"
+        )
+    return Transitions(dataset_id, content, **arrays, low=action_space.low, high=action_space.high, metadata=metadata)
+
+
+def _mapped(folder: Path, sources: Mapping[str, Path]) -> tuple[str, dict[str, Array]] | None:
+    """Return the content hash and the arrays of a converted dataset.
+
+    None if it is not there, is damaged, or was converted from other files than `sources` are now.
+    """
+    try:
+        meta = json.loads(read_text(folder / "meta.json"))
+        paths = {**sources, **{f"{name}.npy": folder / f"{name}.npy" for name in ARRAYS}}
+        files = checked(paths, meta["files"])
+        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ARRAYS}
+    except Exception:  # damaged headers raise what NumPy's parsers happen to; the dataset itself is still there
+        return None
+    if files != meta["files"]:
+        with contextlib.suppress(OffbenchError):  # on a read-only disk they are hashed each time
+            write_json(folder / "meta.json", meta | {"files": files})
+    return str(meta["content_sha256"]), arrays
+
+
+def cache() -> Path:
+    """Return the folder of converted datasets: $OFFBENCH_CACHE, else ~/.cache/offbench."""
+    path = os.environ.get("OFFBENCH_CACHE")
+    if path:
+        return Path(path)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "offbench"
+
+
+def _key(dataset_id: str, metadata: dict[str, Any]) -> str:
+    """Return the cache's name for a dataset: it changes with the content and with the files."""
+    folder = minari_store.path_of(dataset_id) / "data"
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    seen = [(str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+    content = minari_store.provenance(metadata).get("content_sha256")
+    text = json.dumps([4, dataset_id, content, str(folder), seen])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _convert(
+    data: Any,
+    dataset_id: str,
+    observations: gym.spaces.Box,
+    actions: gym.spaces.Box,
+    folder: Path,
+    sources: Mapping[str, Path],
+) -> Path:
+    """Read every episode once and write the arrays beside `folder`, meta.json last; return where they are."""
+    check_storage(dataset_id)
+    columns: dict[str, list[Array]] = {name: [] for name in ("observations", "actions", "rewards", "masks")}
+    content, lengths, returns = minari_store.ContentHash(), [], []
+    with Progress(int(data.total_steps), f"converting {dataset_id}") as progress:
+        for episode in _episodes(data, dataset_id):
+            flat = _episode_arrays(episode, observations, actions, f"{dataset_id}, episode {episode.id}")
+            flags = bool(episode.terminations[-1]), bool(episode.truncations[-1])
+            observed, acted, earned = map(np.asarray, (episode.observations, episode.actions, episode.rewards))
+            content.add(observed, acted, earned, flags)
+            for name, array in flat.items():
+                columns[name].append(array)
+            lengths.append(len(flat["rewards"]))
+            returns.append(float(np.sum(episode.rewards, dtype=np.float64)))
+            progress.to(progress.done + lengths[-1])
+    if not lengths:
+        raise OffbenchError(f"{dataset_id} has no episodes; record it again")
+    arrays = {name: np.concatenate(parts) for name, parts in columns.items()}
+    arrays["actions"] = _scaled(arrays["actions"], actions, dataset_id)
+    ends = np.cumsum(lengths)
+    # each earlier episode put one extra observation row (its last) before this transition
+    arrays["rows"] = np.arange(ends[-1]) + np.repeat(np.arange(len(lengths)), lengths)
+    arrays |= {"ends": ends, "returns": np.array(returns)}
+    aside = folder.with_name(f".{folder.name}.tmp")
+    source = str(minari_store.path_of(dataset_id))
+    _forget(source)
+    _remove_leftovers(folder)
+    aside.mkdir()
+    try:
+        files = {name: recorded(path) for name, path in sources.items()}
+        for name in ARRAYS:
+            with open(aside / f"{name}.npy", "wb") as file:
+                np.save(file, arrays[name], allow_pickle=False)
+                file.flush()
+                os.fsync(file.fileno())
+            files[f"{name}.npy"] = recorded(aside / f"{name}.npy")
+        meta = {"source": source, "content_sha256": content.hexdigest(), "files": files}
+        write_json(aside / "meta.json", meta)
+        shutil.rmtree(folder, ignore_errors=True)
+    except BaseException:
+        shutil.rmtree(aside, ignore_errors=True)
+        raise
+    return aside
+
+
+def _forget(source: str) -> None:
+    """Delete what was converted from an earlier content of the same dataset."""
+    for meta in cache().glob("*/meta.json"):
+        try:
+            superseded = json.loads(meta.read_text()).get("source") == source
+        except (OSError, ValueError, AttributeError):
+            continue
+        if superseded:
+            shutil.rmtree(meta.parent, ignore_errors=True)
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Delete what killed processes left of their conversions: `folder`'s, whose lock is held, and those unlocked."""
+    for aside in folder.parent.glob(".*"):
+        key = aside.name[1:].partition(".")[0]
+        if key == folder.name:
+            shutil.rmtree(aside, ignore_errors=True)
+        elif len(key) == len(folder.name) and aside.is_dir():
+            with contextlib.suppress(Timeout, OSError), FileLock(aside.with_name(f"{key}.lock"), timeout=0):
+                shutil.rmtree(aside, ignore_errors=True)
+
+
+def _episodes(data: Any, dataset_id: str) -> Iterator[Any]:
+    try:
+        yield from data.iterate_episodes()
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        raise OffbenchError(f"{dataset_id} is damaged: {error}; record or download it again") from error
+
+
+def _episode_arrays(
+    episode: Any, observations: gym.spaces.Box, actions: gym.spaces.Box, where: str
+) -> dict[str, Array]:
+    """Return one episode's arrays as float32, checked: shapes, T + 1 observations, finite numbers."""
+    steps = len(episode.rewards)
+    shapes = {
+        "observations": (steps + 1, *observations.shape),
+        "actions": (steps, *actions.shape),
+        "rewards": (steps,),
+        "terminations": (steps,),
+    }
+    for name, shape in shapes.items():
+        found = np.shape(getattr(episode, name))
+        if found != shape or not steps:
+            raise OffbenchError(f"{where}: {name} have shape {found}, expected {shape}; the dataset is damaged")
+    flat = {name: np.asarray(getattr(episode, name), np.float32) for name in ("observations", "actions", "rewards")}
+    for name, array in flat.items():
+        if not np.isfinite(array).all():
+            raise OffbenchError(f"{where}: {name} hold NaN or infinite numbers; filter them out of the dataset")
+    flat["masks"] = 1.0 - np.asarray(episode.terminations, np.float32)
+    return flat
+
+
+def _scaled(actions: Array, space: gym.spaces.Box, dataset_id: str) -> Array:
+    """Return actions scaled from the space's bounds to [-1, 1]; what lies outside is clipped, and said."""
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    scaled = 2.0 * (actions - low) / (high - low) - 1.0
+    outside = int((np.abs(scaled) > 1 + CLIP_TOLERANCE).any(1).sum())
+    if outside:
+        print(f"offbench: warning: {dataset_id}: {outside} actions out of bounds were clipped", file=sys.stderr)
+    return np.clip(scaled, -1, 1).astype(np.float32)

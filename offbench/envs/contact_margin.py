@@ -1,0 +1,30 @@
+"""The field of an EnvSpec that says by which rule contact margins combine."""
+
+from __future__ import annotations
+
+import json
+
+from offbench.common.errors import OffbenchError
+
+MARGIN = "contact_margin"
+EARLIER, ADDED = "max", "sum"  # the larger margin of two geoms, or both together
+SINCE = {EARLIER: "before 3.5", ADDED: "3.5 and later"}  # the MuJoCo versions whose rule it is
+
+
+def with_margin(spec: str, rule: str) -> str:
+    """Return an EnvSpec (JSON) with the rule for contact margins that its environment is to have."""
+    plain = without_margin(spec)[0]
+    return plain if rule == EARLIER else json.dumps(json.loads(plain) | {MARGIN: rule})
+
+
+def without_margin(spec: str) -> tuple[str, str]:
+    """Return Gymnasium's own EnvSpec (JSON), and the rule for contact margins.
+
+    Raises:
+        OffbenchError: there is no such rule.
+    """
+    fields = json.loads(spec)
+    rule = fields.pop(MARGIN, EARLIER)
+    if rule not in (EARLIER, ADDED):
+        raise OffbenchError(f"{MARGIN} must be {EARLIER} or {ADDED}, not {rule!r}")
+    return (json.dumps(fields) if MARGIN in spec else spec), rule

@@ -1,0 +1,178 @@
+"""Recipes: all that is particular to one environment, in one TOML file.
+
+A shipped recipe is known by its folder's name (`hopper`); anybody else's is a file given by path
+(`./my-env.toml`). Algorithms and levels know no environment by name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.resources
+import json
+import tomllib
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from offbench.common.errors import OffbenchError, unknown
+from offbench.common.files import damage, read_text
+from offbench.common.settings import build, setting
+from offbench.envs.contact_margin import ADDED, EARLIER, with_margin
+from offbench.envs.environments import env_spec
+
+
+@dataclass(frozen=True)
+class SACSettings:
+    """How the behaviour agent is trained: Stable-Baselines3's SAC and the ladder kept of it."""
+
+    steps: int = setting(1_000_000, "environment steps of the whole training", low=1)
+    segment: int = setting(10_000, "environment steps between two rungs (and checkpoints)", low=1)
+    envs: int = setting(4, "environments stepped together", low=1)
+    gradient_steps: float = setting(0.25, "gradient steps for each environment step", above=0, high=16)
+    learning_starts: int = setting(10_000, "environment steps of uniform actions before learning", low=0)
+    learning_rate: float = setting(1e-3, "Adam's learning rate at the start", above=0)
+    final_learning_rate: float = setting(3e-4, "learning rate at the end (linear in between)", above=0)
+    batch_size: int = setting(256, "transitions for each gradient step", low=1)
+    hidden: tuple[int, ...] = setting((256, 256), "hidden layers of actor and critics", low=1)
+    discount: float = setting(0.99, "discount", low=0, high=1)
+    tau: float = setting(0.005, "Polyak rate of the target critics", above=0, high=1)
+    rung_episodes: int = setting(5, "episodes that screen each rung, stochastic and deterministic each", low=2)
+
+    def cycle(self) -> tuple[int, int]:
+        """Return (vectorised steps, gradient steps) of one turn of the training loop, both whole numbers."""
+        ratio = Fraction(self.gradient_steps * self.envs).limit_denominator(64)
+        return ratio.denominator, ratio.numerator
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """How many episodes stand behind published numbers."""
+
+    rung_episodes: int = setting(100, "episodes behind the return of a chosen rung", low=2)
+    reference_episodes: int = setting(200, "episodes behind each reference score", low=2)
+    rungs: int = setting(12, "policies kept for `--level FRACTION`", low=2)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One environment: how to make it, how to train its behaviour agent, what its datasets are called."""
+
+    name: str
+    env_id: str
+    version: int = setting(0, "version in the ids of its datasets: hopper-medium-v0", low=0)
+    dataset_steps: int = setting(1_000_000, "transitions of a recorded level", low=1)
+    d4rl_min: float | None = setting(None, "D4RL's reference score of a random policy")
+    d4rl_max: float | None = setting(None, "D4RL's reference score of an expert")
+    contact_margin: str = setting(
+        EARLIER, "contact margins of MuJoCo before 3.5 (max) or since (sum)", choices=(EARLIER, ADDED)
+    )
+    env_kwargs: tuple[tuple[str, Any], ...] = ()
+    sac: SACSettings = dataclasses.field(default_factory=SACSettings)
+    measure: Measurement = dataclasses.field(default_factory=Measurement)
+    folder: Path | None = dataclasses.field(default=None, compare=False, metadata={"internal": True})
+
+    def env_spec(self) -> str:
+        """Return the environment as Gymnasium's EnvSpec JSON. Raises OffbenchError if it cannot be made."""
+        return with_margin(env_spec(self.env_id, **dict(self.env_kwargs)), self.contact_margin)
+
+    def sha256(self) -> str:
+        """Return a hash over everything the recipe says (not over its layout or comments)."""
+        values = {k: v for k, v in dataclasses.asdict(self).items() if k != "folder"}
+        if self.contact_margin == EARLIER:
+            del values["contact_margin"]  # the only rule before it was a setting: hashes of that time stay
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def shipped() -> Path:
+    """Return the folder with the shipped recipes."""
+    return Path(str(importlib.resources.files("offbench"))) / "datasets"
+
+
+def names() -> list[str]:
+    """Return the names of the shipped recipes."""
+    return sorted(path.parent.name for path in shipped().glob("*/recipe.toml"))
+
+
+def load_recipe(name: str) -> Recipe:
+    """Return a shipped recipe by name (`hopper`) or anybody's by path (`./my-env.toml`).
+
+    Raises:
+        OffbenchError: no such recipe, not TOML, an unknown key, a wrong type or value.
+    """
+    if name.endswith(".toml") or "/" in name:
+        return read_recipe(Path(name), folder=None)
+    path = shipped() / name / "recipe.toml"
+    if name not in names():
+        raise unknown("environment", name, names())
+    return read_recipe(path, folder=path.parent)
+
+
+def read_recipe(path: Path, folder: Path | None) -> Recipe:
+    """Read one recipe file. `folder` is where its behaviour weights are shipped, if they are."""
+    where = str(path) if folder is None else f"recipe of {folder.name}"
+    try:
+        with damage(f"{where}: not a readable TOML file", "correct it, or name another"):
+            values = tomllib.loads(read_text(path))
+    except FileNotFoundError:
+        raise OffbenchError(f"no recipe file {path}; write one, or name a shipped one: {', '.join(names())}") from None
+    values.setdefault("name", path.stem if folder is None else folder.name)
+    values["env_kwargs"] = _kwargs(values.pop("env_kwargs", {}), where)
+    tables = {"sac": SACSettings, "measure": Measurement}
+    parts: dict[str, Any] = {
+        key: build(cls, _table(values.pop(key, {}), key, where), f"{where}: [{key}]") for key, cls in tables.items()
+    }
+    kwargs = values.pop("env_kwargs")
+    recipe = dataclasses.replace(build(Recipe, values, where), env_kwargs=kwargs, folder=folder, **parts)
+    _check(recipe, where)
+    shipped_one = load_recipe(recipe.name) if folder is None and recipe.name in names() else recipe
+    if recipe.env_id != shipped_one.env_id:
+        raise OffbenchError(
+            f"{where}: {recipe.name} is a shipped environment, {shipped_one.env_id}, and its datasets would have the "
+            "same ids; give the recipe another name (its file's, or `name = ...`)"
+        )
+    return recipe
+
+
+def _table(value: Any, key: str, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise OffbenchError(f"{where}: {key} must be a table, not {value!r}")
+    return value
+
+
+def _kwargs(value: Any, where: str) -> tuple[tuple[str, Any], ...]:
+    table = _table(value, "env_kwargs", where)
+    try:
+        json.dumps(table)
+    except (TypeError, ValueError):  # a date, a number of 5000 digits
+        words = "numbers, text, true, false, lists and tables"
+        raise OffbenchError(f"{where}: env_kwargs may hold {words} only") from None
+    return tuple(sorted(table.items()))
+
+
+def _check(recipe: Recipe, where: str) -> None:
+    if not recipe.name.replace("-", "").replace("_", "").isalnum():
+        raise OffbenchError(f"{where}: name may hold letters, digits, - and _ only, not {recipe.name!r}")
+    if (recipe.d4rl_min is None) != (recipe.d4rl_max is None):
+        raise OffbenchError(f"{where}: give both d4rl_min and d4rl_max, or neither")
+    sac = recipe.sac
+    if not sac.cycle()[1]:
+        raise OffbenchError(f"{where}: [sac] gradient_steps x envs must be at least 1/64")
+    if sac.learning_starts >= sac.steps:
+        raise OffbenchError(
+            f"{where}: [sac] learning_starts {sac.learning_starts:,} leaves none of {sac.steps:,} steps to learn in"
+        )
+    turn = sac.cycle()[0] * sac.envs
+    if sac.segment % turn:
+        raise OffbenchError(f"{where}: [sac] segment must be a multiple of {turn} (envs x the steps of a turn)")
+
+
+def d4rl_constants(env_id: str) -> tuple[float, float] | None:
+    """Return D4RL's reference scores for an environment by its family (Hopper-v2 to -v5), None if it has none."""
+    family = env_id.split("/")[-1].rpartition("-v")[0]
+    for name in names():
+        recipe = load_recipe(name)
+        if recipe.d4rl_min is not None and recipe.d4rl_max is not None and recipe.env_id.startswith(f"{family}-v"):
+            return recipe.d4rl_min, recipe.d4rl_max
+    return None

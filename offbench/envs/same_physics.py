@@ -1,0 +1,34 @@
+"""Whether an environment moves on the installed MuJoCo as on the recorded one."""
+
+from __future__ import annotations
+
+import sys
+
+from offbench.common.provenance import versions
+
+
+def warn_other_physics(what: str, recorded: dict[str, str], spec: str) -> None:
+    """Print a warning when `what` was made on a MuJoCo that moves the environment of an EnvSpec (JSON) differently."""
+    made, here = recorded.get("mujoco", ""), versions()["mujoco"]
+    if made and not _same_physics(made, here, spec):
+        print(
+            f"offbench: warning: {what} was made with mujoco {made}, installed is {here}: "
+            "the physics differ, scores may not compare",
+            file=sys.stderr,
+        )
+
+
+def _same_physics(a: str, b: str, spec: str) -> bool:
+    """Return whether an environment moves alike on two MuJoCo versions; see offbench.physics."""
+    from offbench.envs.environments import make_env
+    from offbench.envs.physics import RK4_ROTATIONS_SINCE, model_of, release, rotations_changed
+
+    try:
+        if (release(a) >= RK4_ROTATIONS_SINCE) == (release(b) >= RK4_ROTATIONS_SINCE):
+            return True
+    except ValueError:
+        return a == b
+    env = make_env(spec)
+    model = model_of(env)
+    env.close()
+    return model is None or not rotations_changed(model)

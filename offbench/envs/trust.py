@@ -1,0 +1,140 @@
+"""The gate for environments that a file names: what may be imported and made, and with which arguments.
+
+A dataset, run or policy names the code that makes its environment. That is judged by name, before anything is
+imported. Recipes are the user's own and do not pass here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
+
+from offbench.common.errors import OffbenchError
+
+VARIABLE = "OFFBENCH_TRUST"
+REMEDY = f"if you trust where it is from, add --trust ({VARIABLE}=1 in Python)"
+# whose environments may be made, registered or not; imported D4RL files name gym's
+PACKAGES = ("gymnasium.envs.", "gymnasium_robotics.envs.", "gym.envs.")
+# of gymnasium.wrappers: those for flat spaces that write no file, open no window and take no function
+WRAPPERS = {
+    "ClipAction",
+    "ClipReward",
+    "DelayObservation",
+    "DtypeObservation",
+    "FilterObservation",
+    "FlattenObservation",
+    "FrameStackObservation",
+    "MaxAndSkipObservation",
+    "NormalizeObservation",
+    "NormalizeReward",
+    "OrderEnforcing",
+    "PassiveEnvChecker",
+    "RecordEpisodeStatistics",
+    "RepeatAction",
+    "RescaleAction",
+    "RescaleObservation",
+    "ReshapeObservation",
+    "StickyAction",
+    "TimeAwareObservation",
+    "TimeLimit",
+}
+ENTRY_POINT = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)", re.ASCII)
+LARGEST = 10_000  # whole number among arguments: frame_skip = 2e9 would never return
+MOST = 10_000  # values in all arguments together
+DEEPEST = 10
+LONGEST = 200  # characters of a text
+
+
+@contextlib.contextmanager
+def trusting() -> Iterator[None]:
+    """Let files name any environment within this context, in processes started in it too."""
+    before = os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[VARIABLE]
+        else:
+            os.environ[VARIABLE] = before
+
+
+def is_trusting() -> bool:
+    """Return whether the user trusts the files given."""
+    return os.environ.get(VARIABLE, "") not in ("", "0")
+
+
+def check_code(spec: EnvSpec) -> None:
+    """Check the EnvSpec of a file; nothing that is not allowed is imported.
+
+    Raises:
+        OffbenchError: it names code or arguments that are not allowed, or no environment or wrapper class.
+    """
+    registered = gym.registry.get(spec.id)
+    if registered is None or registered.entry_point != spec.entry_point:
+        _check_class(spec.entry_point, gym.Env)
+    for wrapper in spec.additional_wrappers:
+        _check_class(wrapper.entry_point, gym.Wrapper)
+    if not is_trusting():
+        if not isinstance(spec.max_episode_steps, int | None):
+            raise OffbenchError(f"its time limit is {spec.max_episode_steps!r}, not a number of steps")
+        plain = _Plain()
+        for name, kwargs in ((spec.id, spec.kwargs), *((w.name, w.kwargs or {}) for w in spec.additional_wrappers)):
+            plain.check(kwargs, f"the arguments of {name}")
+
+
+def _check_class(entry_point: Any, base: type) -> None:
+    names = ENTRY_POINT.fullmatch(str(entry_point))
+    if names is None:
+        raise OffbenchError(f"its entry point {str(entry_point)[:LONGEST]!r} is no module:Class")
+    if not (is_trusting() or _is_allowed(names[1], names[2], base)):
+        kind = "environments" if base is gym.Env else "wrappers"
+        raise OffbenchError(
+            f"it would run {entry_point}, which is not among the {kind} that a file may name; {REMEDY}"
+        )
+    found = getattr(importlib.import_module(names[1]), names[2], None)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise OffbenchError(f"its entry point {entry_point!r} is no {base.__name__} class, it is not run")
+
+
+def _is_allowed(module: str, name: str, base: type) -> bool:
+    if base is gym.Wrapper:
+        return f"{module}.".startswith("gymnasium.wrappers.") and name in WRAPPERS
+    known = (spec.entry_point for spec in gym.registry.values())
+    return f"{module}.".startswith(PACKAGES) or f"{module}:{name}" in known
+
+
+class _Plain:
+    """Checks that arguments are plain values: numbers, short texts that are no paths, lists and tables of them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def check(self, value: Any, where: str, depth: int = 0) -> None:
+        self.count += 1
+        if self.count > MOST or depth > DEEPEST:
+            raise OffbenchError(f"{where} are too many or too deeply nested; {REMEDY}")
+        if isinstance(value, dict):
+            for key, item in value.items():
+                self.check(key, where, depth)
+                self.check(item, where, depth + 1)
+        elif isinstance(value, list | tuple):
+            for item in value:
+                self.check(item, where, depth + 1)
+        elif isinstance(value, str):
+            if len(value) > LONGEST or re.search(r"[/\\\0]", value) or value.startswith((".", "~")):
+                raise OffbenchError(f"{where} hold {value[:LONGEST]!r}, which may lead to a file; {REMEDY}")
+        elif isinstance(value, int):
+            if abs(value) > LARGEST:
+                raise OffbenchError(
+                    f"{where} hold {str(value)[:20]}, and whole numbers may be {LARGEST:,} at most; {REMEDY}"
+                )
+        elif not isinstance(value, float | None):
+            raise OffbenchError(f"{where} hold a {type(value).__name__}; {REMEDY}")

@@ -1,0 +1,228 @@
+"""`video`: episodes of a policy as a film (.mp4) or a moving picture (.gif), drawn off-screen.
+
+    policy -> steps -> every k-th frame, k steps of the environment in 1/fps seconds -> step and return on it -> file
+
+A film runs in real time: k follows from the environment's own frame rate (125 steps a second in Hopper).
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import warnings
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
+
+from offbench.agents.ladder import BEHAVIOUR, find_ladder
+from offbench.common import seeds
+from offbench.common.errors import OffbenchError
+from offbench.common.files import disk_errors, output_file, write_bytes
+from offbench.common.seeds import Purpose
+from offbench.data.levels import SINGLE, parse_level
+from offbench.envs.environments import make_env
+from offbench.envs.recipes import load_recipe
+from offbench.evaluation.evaluate import open_policy
+from offbench.evaluation.renderer import NO_RENDERER, drawing_with, working_backend
+from offbench.rollouts.policy import Policy, uniform
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+ENDINGS = (".gif", ".mp4")
+COLOURS = 64  # of a GIF
+STREAM = (int(Purpose.REFERENCE), 3)  # episodes of their own, seen in no measurement
+
+
+def video(
+    path: str | Path,
+    *,
+    out: str | Path = "video.gif",
+    env: str | None = None,
+    episodes: int = 1,
+    seconds: float | None = None,
+    seed: int = 0,
+    fps: int = 25,
+    size: int = 480,
+) -> Path:
+    """Film episodes of a run's policy, of a policy file, or of a level.
+
+    Args:
+        path: a run directory or a policy file, which act deterministically; or ENV:LEVEL such as `hopper:medium`,
+            whose actions are sampled as they are in its dataset.
+        out: the film's file, .gif or .mp4.
+        env: a recipe, instead of the environment that the run or policy names.
+        episodes: how many, one after the other.
+        seconds: length of the film at most (default: whole episodes).
+        seed: of the episodes.
+        fps: frames a second, about: films run in real time, and show whole steps.
+        size: the longer side in pixels.
+
+    Returns:
+        The file.
+
+    Raises:
+        OffbenchError: no such policy or folder, an environment that cannot be drawn, no renderer, no mp4 encoder.
+    """
+    target = output_file(out)
+    if target.suffix.lower() not in ENDINGS:
+        raise OffbenchError(f"a video's file ends in {' or '.join(ENDINGS)}, not {target.name!r}")
+    if min(episodes, fps, size) < 1 or (seconds is not None and seconds <= 0):
+        raise OffbenchError("episodes, seconds, fps and size must be more than 0")
+    policy, spec, sampled = _who(str(path), env)
+    encode = _gif if target.suffix.lower() == ".gif" else _encoder()
+    backend = working_backend()
+    with drawing_with(backend), _drawable(spec, backend) as world:
+        rate = float(world.metadata.get("render_fps") or fps)
+        every = max(1, round(rate / fps))
+        most = seconds * rate if seconds else float("inf")
+        encode(target, _episodes(_Film(world, policy, sampled, every, size), seed, episodes, most), rate / every)
+    return target
+
+
+def _who(path: str, env: str | None) -> tuple[Policy, str, bool]:
+    """Return the policy, its EnvSpec and whether its actions are sampled."""
+    name, colon, level = path.rpartition(":")
+    if not colon or Path(path).exists():
+        policy, _, spec = open_policy(Path(path), env)
+        return policy, spec, policy.kind == "uniform"
+    recipe = load_recipe(name)
+    source = SINGLE.get(level) or parse_level(level)[1][0].source
+    spec = recipe.env_spec()
+    if source == "uniform":
+        world = make_env(spec)
+        space, shape = world.action_space, world.observation_space.shape
+        world.close()
+        return uniform(space.low, space.high, shape[0], recipe.env_id), spec, True  # type: ignore[attr-defined, index]
+    if source == "replay" or level == "medium-expert":
+        raise OffbenchError(f"{level} is not of one policy; film random, medium, expert or a fraction")
+    ladder = find_ladder(recipe)
+    if ladder is None:
+        raise OffbenchError(
+            f"no ladder of {name} is shipped or in {BEHAVIOUR}/; give a policy file of your own training"
+        )
+    rung = ladder.role(source) if source in ("medium", "expert") else ladder.nearest(float(source))
+    return ladder.load(rung), spec, True
+
+
+def _drawable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
+    """Make the environment for drawing. Raises OffbenchError if it cannot be drawn here."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it does not list this mode: its first picture tells
+            env = make_env(spec, "rgb_array")
+    except Exception as error:  # a third party's environment may raise anything here
+        raise OffbenchError(f"{json.loads(spec)['id']} cannot be filmed (render_mode rgb_array): {error}") from error
+    world = env.unwrapped
+    if isinstance(world, MujocoEnv):
+        if backend is None:
+            env.close()
+            raise OffbenchError(NO_RENDERER)
+        # Gymnasium 1.4 looks from where the model stood at first; the models have a camera that goes along
+        if (camera := mujoco.mj_name2id(world.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")) >= 0:
+            world.mujoco_renderer.camera_id = camera
+    return env
+
+
+@dataclass(frozen=True)
+class _Film:
+    """Who is filmed, whether its actions are sampled, every how many steps, and the longer side in pixels."""
+
+    env: gym.Env[Any, Any]
+    policy: Policy
+    sampled: bool
+    every: int
+    size: int
+
+
+def _episodes(film: _Film, seed: int, count: int, most: float) -> Iterator[Image]:
+    """Yield the frames of episode after episode, of `most` steps together."""
+    for index in range(count):
+        if most > 0:
+            most -= yield from _episode(film, seed, index, most)
+
+
+def _episode(film: _Film, seed: int, index: int, most: float) -> Generator[Image, None, int]:
+    """Play one episode; yield every so many steps a frame, and the last; return its steps."""
+    env, policy = film.env, film.policy
+    rng = seeds.generator(seed, Purpose.ACTION, *STREAM, index)
+    noisy = policy.needs_noise(not film.sampled)
+    observation, _ = env.reset(seed=seeds.integer(seed, Purpose.RESET, *STREAM, index))
+    step, total, over = 0, 0.0, False
+    yield _frame(env, step, total, film.size)
+    while not over:
+        noise = policy.draw(rng, 1) if noisy else None
+        observation, reward, terminated, truncated, _ = env.step(policy.act(np.asarray(observation)[None], noise)[0])
+        step, total = step + 1, total + float(reward)
+        over = bool(terminated or truncated or step >= most)
+        if over or step % film.every == 0:
+            yield _frame(env, step, total, film.size)
+    return step
+
+
+def _frame(env: gym.Env[Any, Any], step: int, total: float, size: int) -> Image:
+    """Draw the environment as it stands, with step and return on it."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    name = env.spec.id if env.spec else "the environment"
+    try:
+        pixels = env.render()
+    except NotImplementedError:
+        raise OffbenchError(f"{name} cannot be filmed: it has no rgb_array rendering") from None
+    except Exception as error:  # a third party's environment may raise anything here
+        lacks = error.name if isinstance(error, ModuleNotFoundError) else None
+        hint = f"; install the package that has {lacks}" if lacks else ""  # Gymnasium's own errors say which
+        raise OffbenchError(f"{name} cannot be filmed: {str(error) or type(error).__name__}{hint}") from error
+    if not isinstance(pixels, np.ndarray) or pixels.ndim != 3:
+        raise OffbenchError(f"the environment draws {type(pixels).__name__}, not a picture of [height, width, 3]")
+    image = Image.fromarray(pixels[..., :3].astype(np.uint8))
+    scale = size / max(image.size)
+    # even sides, which mp4's pixel format asks for
+    width, height = (max(2, round(side * scale / 2) * 2) for side in image.size)
+    image = image.resize((width, height), Image.Resampling.LANCZOS)
+    font = ImageFont.load_default(max(10, height // 18))
+    text = f"step {step:>4}   return {total:,.0f}"
+    draw = ImageDraw.Draw(image)
+    draw.text((height // 40 + 2, height // 40), text, "white", font, stroke_width=1, stroke_fill="black")
+    return image
+
+
+def _gif(path: Path, frames: Iterator[Image], fps: float) -> None:
+    first, *rest = [frame.quantize(COLOURS) for frame in frames]
+    data = io.BytesIO()
+    # a GIF counts in hundredths of a second
+    first.save(data, "GIF", save_all=True, append_images=rest, duration=round(100 / fps) * 10, loop=0, optimize=True)
+    write_bytes(path, data.getvalue())
+
+
+def _encoder() -> Any:
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise OffbenchError(
+            "mp4 needs imageio-ffmpeg: `pip install 'offbench[video]'`, or give --out video.gif"
+        ) from None
+
+    def mp4(path: Path, frames: Iterator[Image], fps: float) -> None:
+        aside = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
+        with disk_errors(str(path)):
+            try:
+                first = next(frames)
+                writer = imageio_ffmpeg.write_frames(str(aside), first.size, fps=fps, macro_block_size=2, quality=7)
+                writer.send(None)
+                writer.send(first.tobytes())
+                for frame in frames:
+                    writer.send(frame.tobytes())
+                writer.close()
+                aside.replace(path)
+            finally:
+                aside.unlink(missing_ok=True)
+
+    return mp4

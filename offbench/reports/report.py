@@ -1,0 +1,198 @@
+"""`report`: a folder of runs as one page to read, and its tables and figures as files.
+
+    index.html   everything, self-contained
+    tables/      the same tables: CSV, Markdown, LaTeX
+    figures/     the same figures: PNG, SVG
+
+The same runs and local datasets give the same bytes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from offbench.analysis.results import Entry, Method, Results, read_results
+from offbench.common.errors import OffbenchError
+from offbench.common.files import write_bytes
+from offbench.common.tables import Table, files
+from offbench.common.text import counted, plural
+from offbench.reports import figures as draw
+from offbench.reports import tables
+from offbench.reports.datasets import cards, dataset_table
+from offbench.reports.figures import Figure, Line
+from offbench.reports.markup import Markup, join, tag
+from offbench.reports.page import Section, boxes, figures, page, relative, table
+from offbench.reports.similarity import similarity_tables
+from offbench.reports.tables import scale
+
+PAGE = "index.html"
+GENERATOR = '<meta name="generator" content="offbench">'  # by which an older report is known
+STATES = {"unfinished": ("is unfinished", "are unfinished"), "diverged": ("diverged", "diverged")}
+
+
+def report(runs: str | Path = "runs", out: str | Path = "report") -> Path:
+    """Write the report of all runs below a folder.
+
+    Args:
+        runs: the folder of the run directories; one run is enough, unfinished ones are marked.
+        out: the report's folder; an older report in it is replaced.
+
+    Returns:
+        The page.
+
+    Raises:
+        OffbenchError: no evaluated runs, a damaged one, or the folder cannot be written.
+    """
+    folder = Path(out)
+    if folder.suffix.lower() in (".html", ".htm", ".pdf"):
+        raise OffbenchError(f"a report is a folder with an {PAGE} in it: give --out {folder.with_suffix('')}")
+    results = read_results(runs)
+    before = _older(folder)
+    found, pictures = _tables(results), _figures(results)
+    written = {f"tables/{one.name}.{end}": data for one in found.values() for end, data in files(one).items()}
+    for figure in (figure for group in pictures.values() for figure in group):
+        written |= {f"figures/{figure.name}.png": figure.png, f"figures/{figure.name}.svg": figure.svg}
+    for name, data in written.items():
+        write_bytes(folder / name, data)
+    for path in before - {folder / name for name in written}:
+        path.unlink(missing_ok=True)
+    content = page("Offline RL benchmark", _lead(results), list(_sections(results, found, pictures)), boxes(results))
+    write_bytes(folder / PAGE, content)  # last: a page's links all lead somewhere
+    return folder / PAGE
+
+
+def _older(folder: Path) -> set[Path]:
+    """Return the tables and figures of an older report. Raises OffbenchError if the folder is something else's."""
+    if folder.exists() and not folder.is_dir():
+        raise OffbenchError(f"{folder} is a file; give another --out")
+    page = folder / PAGE
+    if not page.exists():
+        return set()
+    if GENERATOR not in page.read_text(encoding="utf-8", errors="replace"):
+        raise OffbenchError(f"{page} is not a report of offbench; give another --out")
+    return {
+        path
+        for kind in ("tables/*.csv", "tables/*.md", "tables/*.tex", "figures/*.png", "figures/*.svg")
+        for path in folder.glob(kind)
+    }
+
+
+def _tables(results: Results) -> dict[str, Table]:
+    known = [tables.score_table(results), tables.seed_table(results), dataset_table(results)]
+    known += similarity_tables(results)
+    beside = tables.beside_table(results)
+    aggregates = tables.iqms(results)
+    if beside:
+        known.append(beside)
+    if aggregates:
+        known.append(tables.iqm_table(results, aggregates))
+    if len(aggregates) > 1:
+        known.append(tables.improvement_table(results, aggregates))
+    return {one.name: one for one in known}
+
+
+def _figures(results: Results) -> dict[str, list[Figure]]:
+    """Return all figures by what they show."""
+    looks = draw.lines(results.methods)
+    rows = [
+        [results.entries[task, m] for m in results.methods if (task, m) in results.entries] for task in results.tasks
+    ]
+    stems = _stems([entries[0].task.name for entries in rows])
+    groups: dict[str, list[Figure]] = {"curves": [], "finals": [], "beta": [], "q": [], "iqm": []}
+    for entries, stem in zip(rows, stems, strict=True):
+        groups["curves"].append(draw.curve_figure(entries, looks, f"curves-{stem}"))
+        groups["finals"].append(draw.final_figure(entries, looks, f"finals-{stem}"))
+        groups["beta"] += _loss(entries, looks, f"beta-{stem}", "beta", "β")
+        groups["q"] += _loss(entries, looks, f"q-{stem}", "q_abs", "mean |Q1(s, a)|")
+    aggregates = tables.iqms(results)
+    if aggregates:
+        groups["iqm"] = [draw.iqm_figure(aggregates, looks), draw.profile_figure(aggregates, looks)]
+    if len(results.tasks) > 1 and aggregates and (over_all := draw.iqm_curve_figure(results, looks)):
+        groups["curves"].append(over_all)
+    return groups
+
+
+def _loss(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str, column: str, label: str) -> list[Figure]:
+    figure = draw.loss_figure(entries, looks, name, column, label)
+    return [figure] if figure else []
+
+
+def _stems(names: Sequence[str]) -> list[str]:
+    """Return a file's stem for each name: safe characters only, each stem once."""
+    stems: list[str] = []
+    for name in names:
+        stem = re.sub(r"[^a-z0-9.-]+", "-", name.lower()).strip("-.") or "task"
+        stems.append(stem if stem not in stems else f"{stem}-{len(stems)}")
+    return stems
+
+
+def _lead(results: Results) -> Markup:
+    entries = list(results.entries.values())
+    runs = [trained for entry in entries for trained in entry.runs]
+    seeds = sorted({len(entry.runs) for entry in entries})
+    states = Counter(trained.state for trained in runs)
+    each = f"{seeds[0]}" if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+    counts = [
+        (f"{len(runs)}", plural(len(runs), "run")),
+        (f"{len(results.tasks)}", plural(len(results.tasks), "dataset")),
+        (f"{len(results.methods)}", plural(len(results.methods), "method")),
+        (each, f"{plural(seeds[-1], 'seed')} a cell"),
+        (f"{sum(trained.reached for trained in runs):,}", "updates trained"),
+    ]
+    tiles = [tag("li", tag("b", value), tag("span", name)) for value, name in counts]
+    told = [f"{count} of {len(runs)} runs {STATES[name][count > 1]}." for name in STATES if (count := states[name])]
+    state = " ".join(told) or "All runs are finished."
+    if results.waiting:
+        state += f" {len(results.waiting)} more {'has' if len(results.waiting) == 1 else 'have'} no evaluation yet."
+    words = f"{scale(results)} {state}"
+    return join(tag("p", words, class_="lead"), tag("ul", *tiles, class_="tiles"))
+
+
+def _sections(
+    results: Results, found: Mapping[str, Table], pictures: Mapping[str, Sequence[Figure]]
+) -> Iterator[Section]:
+    words = "Click a number to see where it comes from: seeds, commands, versions, hardware. Click a header to sort."
+    yield Section("scores", found["scores"].title, [table(found["scores"])], words)
+    if "iqm" in found:
+        parts = [figures(pictures["iqm"]), table(found["iqm"])]
+        yield Section("aggregate", "Across datasets", parts)
+    if "improvement" in found:
+        yield Section("improvement", "Probability of improvement", [table(found["improvement"])])
+    words = "The BDB paper's Figure 4 shows the same of its datasets." if "beside" in found else ""
+    yield Section("curves", "Learning curves", [figures(pictures["curves"])], words)
+    yield Section("finals", "Final scores, seed by seed", [figures(pictures["finals"])])
+    if "beside" in found:
+        yield Section("beside", "Beside published numbers", [table(found["beside"])])
+    if "similarity" in found:
+        more = tag("details", tag("summary", "Both readings"), table(found["similarity-details"]))
+        yield Section("similarity", found["similarity"].title, [table(found["similarity"]), more])
+    if pictures["beta"]:
+        words = "BDB's weight of the discriminator against cloning: 0 is TD3+BC, 1 the discriminator alone."
+        yield Section("beta", "Beta over training", [figures(pictures["beta"])], words)
+    if pictures["q"]:
+        words = (
+            "Mean |Q1| on the dataset's own actions. A critic that diverges is seen here before the score shows it."
+        )
+        yield Section("critic", "Critic over training", [figures(pictures["q"])], words)
+    yield Section("datasets", "Datasets", [table(found["datasets"]), *_shipped(results)])
+    summary = f"Show {counted(len(found['seeds'].rows), 'run')}"
+    every = tag("details", tag("summary", summary), table(found["seeds"]))
+    yield Section("runs", "Every run", [every, _waiting(results)])
+
+
+def _shipped(results: Results) -> list[Markup]:
+    shown = cards(results)
+    words = (
+        "What the shipped recipes of these environments record, whole; the runs were trained on the datasets above."
+    )
+    return [tag("h3", "Shipped cards, for reference"), tag("p", words, class_="note"), *shown] if shown else []
+
+
+def _waiting(results: Results) -> Markup:
+    if not results.waiting:
+        return join()
+    names = [tag("li", relative(results, run)) for run in results.waiting]
+    return join(tag("p", "Begun, not evaluated yet, and so without a score:"), tag("ul", *names))

@@ -1,0 +1,278 @@
+"""The policy file: one safetensors file that says everything needed to act, and a NumPy forward that acts.
+
+    W0 [obs, h]  b0 [h]  W1 [h, h]  b1 [h]  W2 [h, out]  b2 [out]        (x @ W + b, activation between)
+    kind "tanh"               out = act          action = tanh(out)
+    kind "squashed_gaussian"  out = 2 x act      action = tanh(mean + std * noise), log std clipped to [-20, 2]
+    kind "best_by_q"          the squashed Gaussian's best of `samples` actions by Q(observation, action in [-1, 1])
+    kind "uniform"            no weights         action = uniform in the bounds
+
+The forward runs in float64 and rounds the action to float32 at its end. Matrix products differ in their last
+bits between processors and batch sizes; the rounding hides that, so a recorded dataset is the same for any
+number of workers and, but for rare ties, on any machine with the same physics.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from offbench.common.arrays import Array, content_sha256
+from offbench.common.errors import OffbenchError
+from offbench.common.files import damage, read_bytes, write_bytes
+
+if TYPE_CHECKING:
+    from offbench.algorithm.interface import PolicyParts  # brings PyTorch, which processes that play do without
+
+KINDS = ("tanh", "squashed_gaussian", "best_by_q", "uniform")
+Layers = tuple[tuple[Array, Array], ...]
+ACTIVATIONS: dict[str, Callable[[Array], Any]] = {  # in place
+    "relu": lambda x: np.maximum(x, 0.0, out=x),
+    "tanh": lambda x: np.tanh(x, out=x),
+}
+NETWORKS = ("layers", "critic")
+MOST_SAMPLES = 10_000  # actions to choose from; more would fill the memory
+LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # Stable-Baselines3's bounds, and CQL's
+
+
+class _Double(NamedTuple):
+    """A policy's arrays in float64."""
+
+    actor: Layers
+    critic: Layers
+    mean: Array
+    std: Array
+    low: Array
+    high: Array
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy that acts in NumPy.
+
+    Attributes:
+        kind: one of KINDS.
+        layers: (weight [in, out], bias [out]) of each linear layer, float32.
+        observation_mean, observation_std: [obs], the normalisation before the first layer.
+        low, high: [act], the bounds of the environment's action space.
+        env_id: the environment it was trained for.
+        origin: provenance, anything JSON: algorithm, training step, dataset, seed.
+        activation: between layers, a key of ACTIVATIONS.
+        critic, samples: of the kind `best_by_q`: layers of Q, and how many actions it chooses from.
+    """
+
+    kind: str
+    layers: Layers
+    observation_mean: Array
+    observation_std: Array
+    low: Array
+    high: Array
+    env_id: str
+    origin: dict[str, Any] = dataclasses.field(default_factory=dict)
+    critic: Layers = ()
+    samples: int = 1
+    activation: str = "relu"
+
+    @functools.cached_property
+    def _double(self) -> _Double:
+        """What acting needs, in float64, converted once."""
+        actor, critic = (
+            tuple((w.astype(np.float64), b.astype(np.float64)) for w, b in net) for net in (self.layers, self.critic)
+        )
+        parts = (self.observation_mean, self.observation_std, self.low, self.high)
+        return _Double(actor, critic, *(part.astype(np.float64) for part in parts))
+
+    @property
+    def stochastic(self) -> bool:
+        """True if its actions can be sampled."""
+        return self.kind in ("squashed_gaussian", "uniform")
+
+    def needs_noise(self, deterministic: bool) -> bool:
+        """Return whether `act` must be given noise: to sample, or to have actions to choose from."""
+        return self.kind == "best_by_q" or (self.stochastic and not deterministic)
+
+    def draw(self, rng: np.random.Generator, count: int) -> Array:
+        """Return the noise of `count` actions, [count, act]: normal, or uniform in [-1, 1].
+
+        For `best_by_q` it is [count, samples, act].
+        """
+        shape = (count, len(self.low))
+        if self.kind == "uniform":
+            return rng.uniform(-1.0, 1.0, shape)
+        return rng.standard_normal((count, self.samples, len(self.low)) if self.kind == "best_by_q" else shape)
+
+    def act(self, observations: Array, noise: Array | None) -> npt.NDArray[np.float32]:
+        """Return the actions [n, act] for observations [n, obs], in the environment's bounds.
+
+        Args:
+            noise: from `draw`, or None to act deterministically (the mode; uniform has none: zeros).
+        """
+        double = self._double
+        squashed = self._squashed(observations, noise)
+        # +1 before scaling keeps both ends exact: tanh = -1 gives low, tanh = 1 gives high
+        actions = double.low + (squashed + 1.0) * ((double.high - double.low) / 2)
+        return _clip(actions, double.low, double.high).astype(np.float32)
+
+    def _squashed(self, observations: Array, noise: Array | None) -> Array:
+        if self.kind == "uniform":
+            return np.zeros((len(observations), len(self.low))) if noise is None else noise
+        double = self._double
+        x = (np.asarray(observations, np.float64) - double.mean) / double.std
+        out = _forward(double.actor, x, self.activation)
+        if self.kind == "tanh":
+            return np.asarray(np.tanh(out))
+        mean, log_std = out[:, : len(self.low)], out[:, len(self.low) :]
+        std = np.exp(_clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
+        if noise is None or self.kind == "squashed_gaussian":
+            return np.asarray(np.tanh(mean if noise is None else mean + std * noise))
+        actions = np.tanh(mean[:, None] + std[:, None] * noise)  # [n, samples, act]
+        repeated = np.broadcast_to(x[:, None], (*actions.shape[:2], x.shape[1]))
+        best = _forward(double.critic, np.concatenate([repeated, actions], -1), self.activation)[..., 0].argmax(1)
+        chosen: Array = actions[np.arange(len(actions)), best]
+        return chosen
+
+    def to_bytes(self) -> bytes:
+        """Return the policy file's content."""
+        tensors: dict[str, Array] = {"low": self.low, "high": self.high}
+        tensors |= {"observation_mean": self.observation_mean, "observation_std": self.observation_std}
+        for net, layers in zip(NETWORKS, (self.layers, self.critic), strict=True):
+            for i, (weight, bias) in enumerate(layers):
+                tensors |= {f"{net}.{i}.weight": weight, f"{net}.{i}.bias": bias}
+        header = {
+            "format": "offbench-policy-1",
+            "kind": self.kind,
+            "env_id": self.env_id,
+            "origin": self.origin,
+            "samples": self.samples,
+            "activation": self.activation,
+        }
+        arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in tensors.items()}
+        header["sha256"] = content_sha256(arrays, header)
+        return bytes(save(arrays, metadata={"offbench": json.dumps(header, sort_keys=True)}))
+
+    def save(self, path: Path) -> None:
+        """Write the policy file, whole or not at all."""
+        write_bytes(path, self.to_bytes())
+
+
+def _clip(x: Array, low: Any, high: Any) -> Array:
+    """`np.clip`, whose checks cost several times as much as a few lanes' numbers."""
+    clipped: Array = np.minimum(np.maximum(x, low), high)
+    return clipped
+
+
+def _forward(layers: Layers, x: Array, activation: str) -> Array:
+    """Return the last layer's output."""
+    for weight, bias in layers[:-1]:
+        x = x @ weight
+        x += bias
+        ACTIVATIONS[activation](x)
+    weight, bias = layers[-1]
+    out: Array = x @ weight + bias
+    return out
+
+
+def uniform(low: Array, high: Array, observation_dim: int, env_id: str) -> Policy:
+    """Return the policy that draws actions uniformly in the bounds, as D4RL's random level did."""
+    zeros, ones = np.zeros(observation_dim, np.float32), np.ones(observation_dim, np.float32)
+    return Policy("uniform", (), zeros, ones, low, high, env_id, {"algorithm": "uniform"})
+
+
+def load_policy(path: str | os.PathLike[str]) -> Policy:
+    """Read a policy file. Raises OffbenchError if it is not one, or is damaged."""
+    try:
+        with damage(f"{path} is not a readable policy file", "give another, or write it again"):
+            return from_bytes(read_bytes(Path(path)))
+    except FileNotFoundError:
+        raise OffbenchError(f"no policy file {path}") from None
+
+
+def from_bytes(data: bytes) -> Policy:
+    """Read a policy from a file's content. Raises ValueError saying what is wrong with it."""
+    try:
+        tensors = load(data)
+    except (SafetensorError, KeyError, TypeError) as error:  # KeyError: a dtype that NumPy lacks
+        raise ValueError(f"not safetensors ({error})") from None
+    header = _header(data)
+    recorded = header.pop("sha256", None)  # older files have none
+    if recorded is not None and recorded != content_sha256(tensors, header):
+        raise ValueError("its content is not what was written (SHA-256)")
+    if header.get("format") != "offbench-policy-1":
+        raise ValueError(f"unknown format {header.get('format')!r}")
+    sizes = {net: sum(n.startswith(f"{net}.") and n.endswith(".weight") for n in tensors) for net in NETWORKS}
+    names = [f"{net}.{i}.{part}" for net, n in sizes.items() for i in range(n) for part in ("weight", "bias")]
+    wanted = {*names, "low", "high", "observation_mean", "observation_std"}
+    if set(tensors) != wanted:
+        raise ValueError(f"tensors {sorted(wanted.symmetric_difference(tensors))} are missing or too many")
+    env_id, origin = header.get("env_id"), header.get("origin")
+    if not isinstance(env_id, str) or not isinstance(origin, dict):
+        raise ValueError("its header lacks env_id or origin")
+    layers, critic = (
+        tuple((tensors[f"{net}.{i}.weight"], tensors[f"{net}.{i}.bias"]) for i in range(n)) for net, n in sizes.items()
+    )
+    mean, std, low, high = (tensors[name] for name in ("observation_mean", "observation_std", "low", "high"))
+    how = {key: header.get(key, default) for key, default in (("samples", 1), ("activation", "relu"))}
+    policy = Policy(str(header.get("kind")), layers, mean, std, low, high, env_id, origin, critic, **how)
+    _check_shapes(policy)
+    return policy
+
+
+def _header(data: bytes) -> dict[str, Any]:
+    """Return the JSON that the safetensors header carries for us ({} if there is none)."""
+    length = int.from_bytes(data[:8], "little")
+    try:
+        header = json.loads(json.loads(data[8 : 8 + length]).get("__metadata__", {}).get("offbench", "{}"))
+    except (json.JSONDecodeError, AttributeError, TypeError, RecursionError):
+        return {}
+    return header if isinstance(header, dict) else {}
+
+
+def _check_shapes(p: Policy) -> None:
+    arrays = [p.observation_mean, p.observation_std, p.low, p.high, *(a for pair in p.layers + p.critic for a in pair)]
+    if any(a.dtype != np.float32 for a in arrays):
+        raise ValueError("every tensor must be float32")
+    if not all(np.isfinite(a).all() for a in arrays):
+        raise ValueError("it holds NaN or infinite numbers")
+    dim, act = p.observation_mean.shape, p.low.shape
+    if any(a.ndim != 1 for a in arrays[:4]) or dim != p.observation_std.shape or act != p.high.shape:
+        raise ValueError("the shapes of bounds or normalisation do not agree")
+    check_networks(p, dim[0], act[0])
+    if p.kind != "uniform" and ((p.observation_std <= 0).any() or (p.high <= p.low).any()):
+        raise ValueError("a std is not positive, or bounds are out of order")
+
+
+def check_networks(parts: Policy | PolicyParts, observations: int, actions: int) -> None:
+    """Raise ValueError if the kind is unknown, or the layers do not lead from observations to its outputs."""
+    if parts.kind not in KINDS:
+        raise ValueError(f"unknown kind {parts.kind!r}; known: {', '.join(KINDS)}")
+    if not isinstance(parts.activation, str) or parts.activation not in ACTIVATIONS:
+        raise ValueError(f"unknown activation {parts.activation!r}; known: {', '.join(ACTIVATIONS)}")
+    if not isinstance(parts.samples, int) or not 1 <= parts.samples <= MOST_SAMPLES:
+        raise ValueError(f"samples must be a whole number from 1 to {MOST_SAMPLES}, not {parts.samples!r}")
+    if parts.kind == "uniform":
+        return
+    _check_layers(parts.layers, observations, actions * (1 if parts.kind == "tanh" else 2))
+    if parts.kind == "best_by_q":
+        _check_layers(parts.critic, observations + actions, 1)
+
+
+def _check_layers(layers: Sequence[tuple[Any, Any]], inputs: int, outputs: int) -> None:
+    if not layers:
+        raise ValueError("it has no layers")
+    width = inputs
+    for weight, bias in layers:
+        if weight.ndim != 2 or bias.shape != weight.shape[1:] or weight.shape[0] != width:
+            raise ValueError(f"a layer of shape {tuple(weight.shape)} does not follow {width} inputs")
+        width = weight.shape[1]
+    if width != outputs:
+        raise ValueError(f"{width} outputs where {outputs} are needed")

@@ -1,0 +1,314 @@
+"""Episodes by seed: the one mechanism that records datasets and evaluates policies.
+
+    episodes 0 1 2 3 ... --> tasks of a few episodes --> worker processes --> episodes in order
+    in a worker: up to LANES episodes step in turn, so one policy forward serves them all
+
+Episode i is reset with integer(seed, RESET, *stream, i) and acts with generator(seed, ACTION, *stream, i), so
+neither the number of workers nor the task it fell into can change it. Workers never import PyTorch.
+"""
+
+from __future__ import annotations
+
+import collections
+import functools
+import math
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from offbench.common import seeds
+from offbench.common.arrays import Array
+from offbench.common.errors import OffbenchError
+from offbench.common.processes import closing, quiet_start, start_errors, start_worker
+from offbench.common.scores import interval
+from offbench.common.seeds import Purpose
+from offbench.envs.environments import make_env
+from offbench.rollouts.policy import Policy, from_bytes
+
+LANES = 16  # episodes that share a policy forward
+TASK = 16  # episodes that travel together
+LAST_TASK = 4  # where a recording ends, fewer travel together
+NOISE_BLOCK = 1024  # actions whose noise is drawn at once
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode.
+
+    Attributes:
+        seed: what the environment was reset with.
+        observations: [T + 1, obs], in the environment's own precision; the last one has no action.
+        actions: [T, act] float32, in the environment's bounds.
+        rewards: [T] float64.
+        terminated, truncated: how it ended, Gymnasium's meaning.
+    """
+
+    seed: int
+    observations: Array
+    actions: npt.NDArray[np.float32]
+    rewards: npt.NDArray[np.float64]
+    terminated: bool
+    truncated: bool
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    def cut(self, length: int) -> Episode:
+        """Return the first `length` steps; an episode cut short is truncated, not terminated."""
+        if length >= len(self):
+            return self
+        return Episode(
+            self.seed,
+            self.observations[: length + 1],
+            self.actions[:length],
+            self.rewards[:length],
+            False,
+            True,
+        )
+
+
+@dataclass(frozen=True)
+class Task:
+    """A few episodes of one policy, as a worker gets them."""
+
+    spec: str
+    policy: bytes
+    seed: int
+    stream: tuple[int, ...]
+    indices: tuple[int, ...]
+    deterministic: bool
+    summary: bool
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What evaluations keep of an episode."""
+
+    ret: float
+    length: int
+
+
+MEASURES = ("return", "low", "high", "length")
+
+
+def summary(outcomes: list[Outcome], prefix: str = "") -> dict[str, float]:
+    """Return mean return, its 95% interval and mean length."""
+    mean, low, high = interval([o.ret for o in outcomes])
+    length = float(np.mean([o.length for o in outcomes]))
+    values = {"return": mean, "low": low, "high": high, "length": length}
+    return {prefix + key: round(value, 4) for key, value in values.items()}
+
+
+class _Lane:
+    """One environment in the middle of an episode."""
+
+    def __init__(self, env: gym.Env[Any, Any], policy: Policy, task: Task, slot: int) -> None:
+        index = task.indices[slot]
+        self.env, self.policy, self.slot = env, policy, slot
+        self.seed = seeds.integer(task.seed, Purpose.RESET, *task.stream, index)
+        self.rng = seeds.generator(task.seed, Purpose.ACTION, *task.stream, index)
+        self.observations = [np.array(env.reset(seed=self.seed)[0])]  # a copy: environments may reuse their array
+        self.actions: list[Array] = []
+        self.rewards: list[float] = []
+        self.noise: Array = np.empty((0, 0))
+
+    def next_noise(self) -> Array:
+        position = len(self.actions) % NOISE_BLOCK
+        if position == 0:
+            self.noise = self.policy.draw(self.rng, NOISE_BLOCK)
+        row: Array = self.noise[position]
+        return row
+
+    def step(self, action: Array) -> Episode | None:
+        """Take one step; return the whole episode if it was the last one."""
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        self.observations.append(np.array(observation))
+        self.actions.append(action)
+        self.rewards.append(float(reward))
+        if not (terminated or truncated):
+            return None
+        rewards = np.array(self.rewards)
+        # a step that both terminates and runs out of time has terminated: nothing is left to bootstrap from
+        ends = (bool(terminated), bool(truncated and not terminated))
+        return Episode(self.seed, np.array(self.observations), np.array(self.actions), rewards, *ends)
+
+
+def play(task: Task) -> list[Episode] | list[Outcome]:
+    """Play a task's episodes and return them in its order."""
+    policy = _policy(task.policy)
+    noisy = policy.needs_noise(task.deterministic)
+    envs = kept_envs(task.spec, min(LANES, len(task.indices)))
+    waiting = iter(range(len(task.indices)))
+    lanes = [_Lane(env, policy, task, slot) for env, slot in zip(envs, waiting, strict=False)]
+    done: list[Any] = [None] * len(task.indices)
+    while lanes:
+        if closing():
+            raise CancelledError
+        observations = np.array([lane.observations[-1] for lane in lanes])
+        noise = np.array([lane.next_noise() for lane in lanes]) if noisy else None
+        actions = policy.act(observations, noise)
+        going = []
+        for lane, action in zip(lanes, actions, strict=True):
+            episode = lane.step(action)
+            if episode is None:
+                going.append(lane)
+                continue
+            done[lane.slot] = Outcome(float(episode.rewards.sum()), len(episode)) if task.summary else episode
+            slot = next(waiting, None)
+            if slot is not None:
+                going.append(_Lane(lane.env, policy, task, slot))
+        lanes = going
+    return done
+
+
+@functools.lru_cache(maxsize=4)
+def _policy(data: bytes) -> Policy:
+    return from_bytes(data)
+
+
+@functools.lru_cache(maxsize=4)
+def _pool_of_envs(spec: str) -> list[gym.Env[Any, Any]]:
+    return []
+
+
+def kept_envs(spec: str, count: int) -> list[gym.Env[Any, Any]]:
+    """Return `count` environments of this process, made once and kept."""
+    pool = _pool_of_envs(spec)
+    while len(pool) < count:
+        pool.append(make_env(spec))
+    return pool[:count]
+
+
+class Rollouts:
+    """Plays episodes of one environment, in this process (workers = 0) or in a pool of worker processes.
+
+    Use as a context manager. Results do not depend on `workers`.
+    """
+
+    def __init__(self, spec: str, workers: int = 0) -> None:
+        self.spec, self.workers = spec, workers
+        self._pool: ProcessPoolExecutor | None = None
+        if workers:
+            context = multiprocessing.get_context("spawn")
+            with start_errors():
+                self._closing = context.RawValue("b", 0)  # no lock, which a killed worker could hold for ever
+                self._pool = ProcessPoolExecutor(workers, context, start_worker, (os.getpid(), self._closing))
+
+    def __enter__(self) -> Rollouts:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool:
+            self._closing.value = 1  # a second of episodes that nobody will look at
+            self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def submit(self, task: Task) -> Future[Any]:
+        """Start a task; its result is the list that `play` returns."""
+        return self.call(play, task)
+
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Start a module's function in a worker process, or run it now if there is none."""
+        if self._pool:
+            with quiet_start():
+                try:
+                    return self._pool.submit(function, *arguments)
+                except BrokenProcessPool:
+                    raise _worker_died() from None
+        future: Future[Any] = Future()
+        future.set_result(function(*arguments))
+        return future
+
+    def episodes(
+        self, policy: Policy, seed: int, stream: tuple[int, ...] = (), enough: int | None = None
+    ) -> Iterator[Episode]:
+        """Yield episodes 0, 1, 2, ... of the sampling policy without end, in order. Close the iterator when done.
+
+        Args:
+            enough: transitions after which nobody will ask for more: near them tasks become small, and none begins
+                that is not likely to be wanted.
+        """
+        data, ahead = policy.to_bytes(), 1 if not self._pool else 2 * self.workers + 1
+        pending: collections.deque[Future[Any]] = collections.deque()
+        begun = done = steps = 0
+        try:
+            while True:
+                while len(pending) < ahead:
+                    # the first tasks are small, so that short recordings keep every worker busy
+                    size = LANES if begun < LANES * ahead else TASK
+                    if enough is not None and done:
+                        wanted = (enough - steps) * done / steps - (begun - done)  # if all are as long as those so far
+                        if wanted <= 0 and pending:
+                            break
+                        size = min(size, max(LAST_TASK, math.ceil(wanted / ahead)))
+                    indices = tuple(range(begun, begun + size))
+                    pending.append(self.submit(Task(self.spec, data, seed, stream, indices, False, False)))
+                    begun += size
+                for episode in result(pending.popleft()):
+                    done, steps = done + 1, steps + len(episode)
+                    yield episode
+        finally:
+            for future in pending:
+                future.cancel()
+
+    def outcomes(
+        self, policy: Policy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
+    ) -> Future[list[Outcome]]:
+        """Start `count` evaluation episodes; the future gives their returns and lengths in order."""
+        tasks = self.outcome_tasks(policy, seed, stream, count, deterministic)
+        return _gather([self.submit(task) for task in tasks])
+
+    def outcome_tasks(
+        self, policy: Policy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
+    ) -> list[Task]:
+        """Cut an evaluation into tasks, one for each worker if there are enough episodes."""
+        data, parts = policy.to_bytes(), max(1, min(self.workers, count // 2))
+        chunks = np.array_split(np.arange(count), parts)
+        return [
+            Task(self.spec, data, seed, stream, tuple(int(i) for i in chunk), deterministic, True) for chunk in chunks
+        ]
+
+
+def result(future: Future[Any]) -> Any:
+    """Return a task's result; a worker that was killed becomes a clear line."""
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        raise _worker_died() from None
+
+
+def _worker_died() -> OffbenchError:
+    return OffbenchError(
+        "a worker process died (killed, or out of memory); run the same command again, with fewer --workers"
+    )
+
+
+def _gather(futures: Sequence[Future[Any]]) -> Future[list[Outcome]]:
+    """Return one future for the results of several, end to end."""
+    whole: Future[list[Outcome]] = Future()
+    left = [len(futures)]
+    lock = threading.Lock()
+
+    def arrived(future: Future[Any]) -> None:
+        with lock:
+            left[0] -= 1
+            if whole.done():
+                return
+            if future.cancelled():
+                whole.cancel()
+            elif future.exception() is not None:
+                whole.set_exception(future.exception())
+            elif left[0] == 0:
+                whole.set_result([outcome for f in futures for outcome in f.result()])
+
+    for future in futures:
+        future.add_done_callback(arrived)
+    return whole

@@ -1,0 +1,127 @@
+"""Batches: the transitions on the device, and the random numbers that choose among them.
+
+    chunk of CHUNK updates:  per run, from (run seed, chunk):  indices [CHUNK, runs, batch], noise [CHUNK, runs, ...]
+
+A run's random numbers depend on its own seed, the chunk and the kind of device alone: it is the same run alone or
+in a stack, and a resume needs no generator state.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from offbench.algorithm.interface import Batch, Draw
+from offbench.common import seeds
+from offbench.common.errors import OffbenchError
+from offbench.common.seeds import Purpose
+from offbench.data.transitions import Transitions
+from offbench.training.run import Run
+
+CHUNK = 100  # updates whose random numbers are drawn together; part of what a seed means, never change
+
+
+@dataclass(frozen=True)
+class Member:
+    """One run of a stack.
+
+    Attributes:
+        algorithm: its name in the registry.
+    """
+
+    run: Run
+    seed: int
+    config: Any
+    data: Transitions
+    algorithm: str
+
+
+class Store:
+    """The transitions of all runs' datasets on the device, end to end, and where each run's begin."""
+
+    def __init__(self, members: Sequence[Member], normalize_observations: bool, device: torch.device) -> None:
+        distinct = {member.data.dataset_id: member.data for member in members}
+        starts, count, row = {}, 0, 0
+        parts: dict[str, list[Tensor]] = {k: [] for k in ("observations", "rows", "actions", "rewards", "masks")}
+        for name, data in distinct.items():
+            starts[name] = count
+            for key, tensors in parts.items():
+                array = getattr(data, key)
+                tensors.append(_tensor(array + row if key == "rows" and row else array))
+            count, row = count + len(data), row + len(data.observations)
+        whole = {key: (t[0] if len(t) == 1 else torch.cat(t)).to(device) for key, t in parts.items()}
+        self.observations, self.rows = whole["observations"], whole["rows"]
+        self.actions, self.rewards, self.masks = whole["actions"], whole["rewards"], whole["masks"]
+        self.sizes = [len(member.data) for member in members]
+        first = [starts[member.data.dataset_id] for member in members]
+        self.chosen: Tensor | None = None  # where runs train on a part: the transitions of each, end to end
+        if any(getattr(member.config, "top", 1.0) < 1 for member in members):
+            chosen = [m.data.best(getattr(m.config, "top", 1.0)) + f for m, f in zip(members, first, strict=True)]
+            self.sizes = [len(part) for part in chosen]
+            first = [sum(self.sizes[:i]) for i in range(len(members))]
+            self.chosen = torch.from_numpy(np.concatenate(chosen)).to(device)
+        self.first = torch.tensor(first, device=device).view(-1, 1)
+        known = {name: data.normalizer() for name, data in distinct.items()} if normalize_observations else {}
+        dim = self.observations.shape[1]
+        identity = (np.zeros(dim, np.float32), np.ones(dim, np.float32))
+        self.normalizers = [known.get(member.data.dataset_id, identity) for member in members]
+        self.mean = torch.from_numpy(np.stack([mean for mean, _ in self.normalizers])).to(device).unsqueeze(1)
+        self.std = torch.from_numpy(np.stack([std for _, std in self.normalizers])).to(device).unsqueeze(1)
+        self.normalize = normalize_observations
+
+    def batch(self, indices: Tensor) -> Batch:
+        """Return the transitions at `indices` [runs, batch], each run's counted from its own first."""
+        flat = (indices + self.first).flatten()
+        if self.chosen is not None:
+            flat = self.chosen.index_select(0, flat)
+        rows = self.rows.index_select(0, flat)
+        shape = (*indices.shape, -1)
+        observations = self.observations.index_select(0, rows).view(shape)
+        next_observations = self.observations.index_select(0, rows + 1).view(shape)
+        if self.normalize:
+            observations = (observations - self.mean) / self.std
+            next_observations = (next_observations - self.mean) / self.std
+        return Batch(
+            observations,
+            self.actions.index_select(0, flat).view(shape),
+            self.rewards.index_select(0, flat).view(indices.shape),
+            next_observations,
+            self.masks.index_select(0, flat).view(indices.shape),
+        )
+
+
+def _tensor(array: Any) -> Tensor:
+    with warnings.catch_warnings():
+        # PyTorch warns that the cache is mapped read-only; nothing here writes to it
+        warnings.simplefilter("ignore", UserWarning)
+        return torch.from_numpy(array)
+
+
+def draw_chunk(
+    run_seeds: Sequence[int],
+    sizes: Sequence[int],
+    batch_size: int,
+    draws: Mapping[str, Draw],
+    chunk: int,
+    device: torch.device,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return a chunk's batch indices [CHUNK, runs, batch] and noise {name: [CHUNK, runs, *shape]}."""
+    indices, noise = [], {name: [] for name in draws}  # type: tuple[list[Tensor], dict[str, list[Tensor]]]
+    for seed, size in zip(run_seeds, sizes, strict=True):
+        generator = torch.Generator(device).manual_seed(seeds.integer(seed, Purpose.CHUNK, chunk))
+        indices.append(torch.randint(size, (CHUNK, batch_size), generator=generator, device=device))
+        for name, draw in draws.items():
+            shape = (CHUNK, *draw.shape)
+            if draw.distribution == "normal":
+                noise[name].append(torch.randn(shape, generator=generator, device=device))
+            elif draw.distribution == "uniform":
+                noise[name].append(torch.rand(shape, generator=generator, device=device) * 2 - 1)
+            else:
+                raise OffbenchError(f"draws: {name!r} must be normal or uniform, not {draw.distribution!r}")
+    return torch.stack(indices, 1), {name: torch.stack(parts, 1) for name, parts in noise.items()}

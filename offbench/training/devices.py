@@ -1,0 +1,104 @@
+"""The device that a stack trains on: which, with what precision, and how many runs it holds."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+import threadpoolctl
+import torch
+
+from offbench.algorithm.interface import Algorithm
+from offbench.algorithm.mlp import products_by
+from offbench.common.errors import OffbenchError
+from offbench.common.provenance import has_bfloat16
+from offbench.training.batches import Member
+from offbench.training.stack import WARM_UP, Stack
+
+CPU_STACK = 8  # runs of one process: more gain nothing there, and each waits for all
+PRECISIONS = ("float32", "tf32", "bfloat16")
+MEMORY_SHARE = 0.8  # of a GPU's free memory that a stack may take
+
+
+def pick_device(device: str) -> str:
+    """Return the device to train on: `auto` takes a GPU if there is one.
+
+    Raises:
+        OffbenchError: not a device, or one that this machine lacks.
+    """
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    kind, _, index = device.partition(":")
+    if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
+        raise OffbenchError(f"device must be auto, cpu, cuda or cuda:N, not {device!r}")
+    if kind == "cuda" and (not torch.cuda.is_available() or int(index or 0) >= torch.cuda.device_count()):
+        found = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        raise OffbenchError(
+            f"no device {device}: PyTorch {torch.__version__} sees {found} GPUs here; use --device cpu"
+        )
+    return device
+
+
+def check_precision(precision: str, device: str) -> None:
+    """Raise OffbenchError if a device (cpu or cuda:N) has no such matrix products."""
+    if precision not in PRECISIONS:
+        raise OffbenchError(f"precision must be {', '.join(PRECISIONS[:-1])} or {PRECISIONS[-1]}, not {precision!r}")
+    if precision == "tf32" and device == "cpu":
+        raise OffbenchError("precision tf32 is of GPUs; use float32 on a CPU")
+    native = has_bfloat16() if device == "cpu" else torch.cuda.is_bf16_supported(including_emulation=False)
+    if precision == "bfloat16" and not native:
+        what = "this processor" if device == "cpu" else f"this GPU ({torch.cuda.get_device_name(device)})"
+        raise OffbenchError(f"{what} cannot multiply bfloat16 numbers natively; use float32")
+
+
+@contextmanager
+def arithmetic(device: str, precision: str = "float32") -> Iterator[None]:
+    """Set threads and precision of matrix products for a training, and put them back after it.
+
+    On the CPU one thread, NumPy's products included: two runs in two processes beat one run on two threads.
+
+    Args:
+        precision: float32, tf32 (float32 with 10 bits of mantissa in products) or bfloat16 (`perceptrons`).
+
+    Raises:
+        OffbenchError: the device has no such products.
+    """
+    check_precision(precision, device)
+    threads, before = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if precision == "tf32" else "highest")
+    with ExitStack() as undo:
+        undo.callback(torch.set_float32_matmul_precision, before)
+        if precision == "bfloat16":
+            undo.enter_context(products_by("bfloat16"))
+        if device == "cpu":
+            torch.set_num_threads(1)
+            undo.callback(torch.set_num_threads, threads)
+            undo.enter_context(threadpoolctl.threadpool_limits(1, user_api="blas"))
+            undo.enter_context(np.errstate(all="ignore"))  # a run that diverges is reported once, by Stack.diverged
+        yield
+
+
+def stack_size(kind: type[Algorithm], member: Member, device: str) -> int:
+    """Return how many runs like `member` train best as one stack on this device.
+
+    On a GPU what its free memory holds, measured: the peaks of a stack of one and of three runs over a few updates
+    tell what a run costs beside the dataset.
+    """
+    if device == "cpu":
+        return CPU_STACK
+    peaks = []
+    for runs in (1, 3):
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_reserved(device)
+        stack = Stack(kind, [member] * runs, device)
+        for _ in stack.train(4 * WARM_UP):
+            pass
+        peaks.append(torch.cuda.max_memory_reserved(device) - before)
+        del stack
+        gc.collect()
+        torch.cuda.empty_cache()
+    cost = max((peaks[1] - peaks[0]) / 2, 1.0)
+    free, _ = torch.cuda.mem_get_info(device)
+    return max(1, int((MEMORY_SHARE * free - peaks[0]) / cost) + 1)

@@ -1,0 +1,104 @@
+"""What offbench recorded about a dataset, against the data: content hash, parts, seeds, levels and their returns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from offbench.common import seeds
+from offbench.common.scores import normalize
+from offbench.common.seeds import Purpose
+from offbench.data.levels import LEVELS
+from offbench.verification.findings import Findings, Report
+from offbench.verification.scan import Survey
+
+SIGMAS = 6  # a level's mean return may be off by so many standard errors,
+SLACK = 0.02  # and by this share of the references' distance: rungs are chosen for their measured return
+
+
+def check_claims(
+    ours: dict[str, Any], found: Survey, limit: int | None, report: Report, findings: Findings
+) -> list[int]:
+    """Check what offbench recorded about a dataset; return the last episode of each part."""
+    last = [len(found.lengths) - 1] if found.lengths else []
+    if "content_sha256" in ours:
+        report.checked.append("the content hash")
+        if ours["content_sha256"] != found.content.hexdigest():
+            findings.add("content-hash", "metadata", f"recorded {str(ours['content_sha256'])[:12]}...")
+    else:
+        report.skipped.append("the content hash: none is recorded")
+    if "parts" not in ours:
+        report.skipped.append("levels and returns: not recorded by offbench")
+        return last
+    try:
+        cuts = _cuts(ours["parts"], found, findings)
+        if cuts is not None:
+            _levels(ours, findings)
+            for index, (part, (first, end)) in enumerate(zip(ours["parts"], cuts, strict=True)):
+                _part(ours, part, index, range(first, end), found, limit, findings)
+            last = [end - 1 for _, end in cuts]
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, ZeroDivisionError, OverflowError) as error:
+        findings.add("metadata", "metadata", f"{type(error).__name__}: {error}")
+    report.checked.append("parts, seeds, level order and mean returns against the metadata")
+    return last
+
+
+def _cuts(parts: Sequence[dict[str, Any]], found: Survey, findings: Findings) -> list[tuple[int, int]] | None:
+    """Return the episodes [first, end) of each part, or None if parts do not end where episodes do."""
+    ends = np.cumsum(found.lengths)
+    wanted = np.cumsum([int(part["transitions"]) for part in parts])
+    places = np.searchsorted(ends, wanted)
+    if len(places) == 0 or places[-1] != len(ends) - 1 or (ends[places] != wanted).any():
+        findings.add("parts", "metadata", f"parts end after {wanted.tolist()} transitions")
+        return None
+    return list(zip([0, *(places[:-1] + 1)], places + 1, strict=True))
+
+
+def _levels(ours: dict[str, Any], findings: Findings) -> None:
+    """Check that the levels' own numbers agree with each other."""
+    low, high = (float(ours["references"][name]["return"]) for name in ("random", "expert"))
+    known = {part["source"]: float(part["return"]) for part in ours["parts"] if "return" in part}
+    order = [known[name] for name in ("uniform", "medium", "expert") if name in known]
+    if not low < high or order != sorted(order) or known.get("medium", low) >= high:
+        findings.add("level-order", "metadata", f"random {low:g}, expert {high:g}, parts {known}")
+    if ours["level"] in LEVELS and [p.source for p in LEVELS[ours["level"]]] != [p["source"] for p in ours["parts"]]:
+        findings.add("metadata", "metadata", f"level {ours['level']} is not made of these parts")
+    for part in ours["parts"]:
+        if "fraction" in part and abs(normalize(float(part["return"]), low, high) / 100 - part["fraction"]) > 0.01:
+            findings.add(
+                "level-order", f"part {part['source']}", f"its fraction {part['fraction']} is not its return's"
+            )
+
+
+def _part(
+    ours: dict[str, Any],
+    part: dict[str, Any],
+    index: int,
+    chosen: range,
+    found: Survey,
+    limit: int | None,
+    out: Findings,
+) -> None:
+    """Check one part's seeds and mean return."""
+    if part["source"] != "replay":
+        for k, i in enumerate(chosen):
+            if found.seeds[i] != seeds.integer(int(ours["seed"]), Purpose.RESET, index, k):
+                out.add("wrong-seeds", f"episode {i}")
+    if "return" not in part:
+        return
+    whole = [found.returns[i] for i in chosen if found.ended[i][0] or limit is None or found.lengths[i] == limit]
+    if not whole or not np.isfinite(whole).all():
+        return
+    count = int(part.get("episodes") or ours["references"]["random"]["episodes"])
+    half = (float(part["interval"][1]) - float(part["interval"][0])) / 2 / 1.96
+    # the spread of single returns: as measured here and as behind the recorded interval, whichever is wider
+    spread = max(float(np.std(whole, ddof=1)) if len(whole) > 1 else 0.0, half * count**0.5)
+    references = ours["references"]
+    slack = SLACK * abs(float(references["expert"]["return"]) - float(references["random"]["return"]))
+    allowed = SIGMAS * (spread**2 / len(whole) + half**2) ** 0.5 + slack
+    mean, recorded = float(np.mean(whole)), float(part["return"])
+    if not abs(mean - recorded) <= allowed:
+        detail = f"{mean:.1f} over {len(whole)} episodes, recorded {recorded:.1f}, plausible within {allowed:.1f}"
+        out.add("wrong-level", f"part {part['source']}", detail)

@@ -1,0 +1,169 @@
+"""One pass over every episode of a dataset: what can be seen without the environment, and what later checks need."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from offbench.common.arrays import Array
+from offbench.common.progress import Progress
+from offbench.data.minari_reader import Recorded, episodes_of
+from offbench.data.minari_store import ContentHash
+from offbench.verification.findings import Findings
+
+PILE = 10  # equal actions at the outermost value that are no coincidence,
+PILE_SHARE = 0.001  # if they are at least this share of all
+INSIDE = 1e-4  # of the span: a bound nearer to the space's than this is the space's
+
+
+@dataclass
+class Survey:
+    """What one pass over the episodes found."""
+
+    content: ContentHash = field(default_factory=ContentHash)
+    lengths: list[int] = field(default_factory=list)
+    returns: list[float] = field(default_factory=list)
+    seeds: list[int | None] = field(default_factory=list)
+    ended: list[tuple[bool, bool]] = field(default_factory=list)
+    sound: list[bool] = field(default_factory=list)  # whether the arrays fit together and hold numbers
+
+    @property
+    def steps(self) -> int:
+        """Transitions in all."""
+        return sum(self.lengths)
+
+
+def survey(data: Any, limit: int | None, findings: Findings) -> Survey:
+    """Look at every episode of a MinariDataset once; `limit` is the environment's time limit, if it has one."""
+    found, piles, twins = Survey(), _Piles(data.action_space), _Twins()
+    with Progress(int(data.total_steps), f"verifying {data.spec.dataset_id}") as progress:
+        for episode in episodes_of(data):
+            where = f"episode {episode.index}"
+            numeric = all(array.dtype.kind in "fiub" for array in episode.arrays)
+            sound = numeric and _check(episode, data.observation_space, data.action_space, limit, where, findings)
+            ends = tuple(bool(flags[-1]) if flags.size else False for flags in episode.arrays[3:])
+            found.lengths.append(len(episode))
+            found.seeds.append(episode.seed)
+            found.ended.append((ends[0], ends[1]))
+            found.sound.append(sound)
+            found.returns.append(float(np.sum(episode.rewards, dtype=np.float64)) if numeric else float("nan"))
+            if numeric:
+                found.content.add(episode.observations, episode.actions, episode.rewards, found.ended[-1])
+                twins.add(episode, findings)
+            else:
+                findings.add("dtype", where, "not numbers")
+            if sound:
+                piles.add(episode.actions)
+            progress.to(progress.done + len(episode))
+    piles.report(findings)
+    _seeds(found.seeds, findings)
+    return found
+
+
+def _check(
+    e: Recorded, observations: gym.spaces.Box, actions: gym.spaces.Box, limit: int | None, where: str, out: Findings
+) -> bool:
+    """Check one episode by itself; return whether its arrays fit together, so that it can be played again."""
+    steps = len(e)
+    wanted = {
+        "observations": (steps + 1, *observations.shape),
+        "actions": (steps, *actions.shape),
+        "rewards": (steps,),
+        "terminations": (steps,),
+        "truncations": (steps,),
+    }
+    sound = steps > 0
+    for name, shape in wanted.items():
+        array = getattr(e, name)
+        if array.shape != shape or not steps:
+            out.add("shape", where, f"{name} {array.shape}, expected {shape}")
+            sound = False
+    for name, space in (("observations", observations), ("actions", actions)):
+        if getattr(e, name).dtype != space.dtype:
+            out.add("dtype", where, f"{name} are {getattr(e, name).dtype}, their space is {space.dtype}")
+    for name in ("terminations", "truncations"):
+        if getattr(e, name).dtype != np.bool_:
+            out.add("dtype", where, f"{name} are {getattr(e, name).dtype}, not bool")
+    for name in ("observations", "actions", "rewards"):
+        array = getattr(e, name)
+        if not np.issubdtype(array.dtype, np.number) or not np.isfinite(array).all():
+            out.add("not-finite", where, name)
+            sound = False
+    if sound:
+        _check_ends(e, limit, where, out)
+        _check_bounds(e, observations, actions, where, out)
+    return sound
+
+
+def _check_ends(e: Recorded, limit: int | None, where: str, out: Findings) -> None:
+    ends = e.terminations.astype(bool) | e.truncations.astype(bool)
+    if ends[:-1].any():
+        out.add("early-end", where, f"step {int(np.flatnonzero(ends)[0])} of {len(e)}")
+    if not ends[-1]:
+        out.add("no-end", where)
+    if limit is not None and len(e) > limit:
+        out.add("too-long", where, f"{len(e)} steps, the limit is {limit}")
+
+
+def _check_bounds(
+    e: Recorded, observations: gym.spaces.Box, actions: gym.spaces.Box, where: str, out: Findings
+) -> None:
+    if ((e.observations < observations.low) | (e.observations > observations.high)).any():
+        out.add("outside-space", where)
+    over = np.maximum(actions.low - e.actions, e.actions - actions.high)
+    if (over > 0).any():
+        out.add("action-bounds", where, f"by up to {over.max():g}")
+
+
+class _Piles:
+    """Finds actions that pile up at a bound of their own, inside the space's: they were clipped after the fact."""
+
+    def __init__(self, space: gym.spaces.Box) -> None:
+        self.space, self.total = space, 0
+        self.ends = [np.full(space.shape, sign * -np.inf) for sign in (-1, 1)]  # lowest and highest seen so far
+        self.counts = [np.zeros(space.shape, np.int64) for _ in range(2)]
+
+    def add(self, actions: Array) -> None:
+        self.total += len(actions)
+        for side, (sign, best) in enumerate(((-1, actions.min(0)), (1, actions.max(0)))):
+            further = sign * best > sign * self.ends[side]
+            self.ends[side] = np.where(further, best, self.ends[side])
+            self.counts[side] = np.where(further, 0, self.counts[side]) + (actions == self.ends[side]).sum(0)
+
+    def report(self, findings: Findings) -> None:
+        low, high = self.space.low.astype(np.float64), self.space.high.astype(np.float64)
+        inside = (self.ends[0] > low + INSIDE * (high - low), self.ends[1] < high - INSIDE * (high - low))
+        for side, name in enumerate(("at least", "at most")):
+            piled = inside[side] & (self.counts[side] >= max(PILE, PILE_SHARE * self.total))
+            for i in np.argwhere(piled):
+                place = tuple(i)
+                # one constant action is no clipping
+                if self.counts[side][place] < self.total:
+                    detail = f"{self.counts[side][place]:,} are exactly {self.ends[side][place]:g}, all {name} that"
+                    findings.add("clipped-actions", f"action {'.'.join(map(str, place))}", detail)
+
+
+class _Twins:
+    """Finds episodes that are there twice."""
+
+    def __init__(self) -> None:
+        self.known: dict[bytes, int] = {}
+
+    def add(self, e: Recorded, findings: Findings) -> None:
+        digest = hashlib.blake2b(digest_size=16)
+        for array in (e.observations, e.actions, e.rewards):
+            digest.update(np.ascontiguousarray(array).data)
+        first = self.known.setdefault(digest.digest(), e.index)
+        if first != e.index:
+            findings.add("duplicate-episodes", f"episodes {first} and {e.index}")
+
+
+def _seeds(seeds: list[int | None], findings: Findings) -> None:
+    known: dict[int, int] = {}
+    for i, seed in enumerate(seeds):
+        if seed is not None and known.setdefault(seed, i) != i:
+            findings.add("repeated-seeds", f"episodes {known[seed]} and {i}", f"seed {seed}")

@@ -1,0 +1,188 @@
+"""`verify`: is a dataset what it says? Its episodes, its metadata against them, and a sample of them played again.
+
+survey        one pass over every episode: shapes, ends, numbers, bounds, twins, seeds, content hash
+metadata      parts, levels and their returns, as offbench recorded them
+resimulate    a sample of episodes played again in the environment
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from offbench.common import seeds
+from offbench.common.errors import OffbenchError
+from offbench.common.processes import default_workers
+from offbench.common.provenance import versions
+from offbench.common.seeds import Purpose
+from offbench.common.text import counted
+from offbench.data import minari_store
+from offbench.data.minari_reader import Recorded, episodes_of
+from offbench.data.recorded_env import margins_matter, recorded_margin, recorded_mujoco
+from offbench.envs.contact_margin import ADDED, EARLIER, SINCE, with_margin
+from offbench.envs.environments import believed_env, box
+from offbench.rollouts.rollouts import Rollouts, result
+from offbench.verification.findings import Findings, Report
+from offbench.verification.metadata import check_claims
+from offbench.verification.resimulate import Verdict, check
+from offbench.verification.scan import Survey, survey
+
+EPISODES = 300  # played again by default: half a minute for a million transitions
+SOME = 10  # of them tell the rule for contact margins, about
+REQUIREMENT = {EARLIER: "mujoco<3.5", ADDED: "mujoco>=3.5"}
+FEW = 20_000  # steps to play again that are not worth worker processes
+
+
+def verify(dataset_id: str, *, episodes: int | None = None, workers: int | None = None) -> Report:
+    """Check a local Minari dataset with flat Box spaces, whoever made it.
+
+    Args:
+        dataset_id: its id.
+        episodes: how many are played again in the environment, where that is possible (default: 300).
+        workers: processes for it (default: one a core).
+
+    Returns:
+        The report; `report.ok` is False if something is off. Damaged data are findings, not errors.
+
+    Raises:
+        OffbenchError: no such dataset, or spaces other than flat Boxes.
+    """
+    from offbench.data.minari_reader import open_minari  # here, because `verify --help` need not wait for Minari
+
+    report, findings = Report(dataset_id), Findings()
+    if not minari_store.exists(dataset_id):
+        minari_store.read_metadata(dataset_id)  # raises, and names the nearest id
+    workers, episodes = default_workers(workers), EPISODES if episodes is None else episodes
+    code = "metadata"
+    try:
+        metadata = minari_store.read_metadata(dataset_id)
+        code = "unreadable"
+        data = open_minari(dataset_id)
+    except OffbenchError as error:
+        findings.add(code, dataset_id, str(error))
+        return dataclasses.replace(report, findings=findings.all())
+    box(data.observation_space, f"{dataset_id}: observations")
+    box(data.action_space, f"{dataset_id}: actions")
+    spec = metadata.get("env_spec")
+    try:
+        found = survey(data, _limit(spec), findings)
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, AssertionError) as error:
+        findings.add("unreadable", dataset_id, str(error))
+        return dataclasses.replace(report, findings=findings.all())
+    report.transitions, report.episodes = found.steps, len(found.lengths)
+    report.checked.append("every episode: shapes, types, ends, finite numbers, bounds, duplicates, seeds")
+    _counts(metadata, dataset_id, found, findings)
+    last = check_claims(minari_store.provenance(metadata), found, _limit(spec), report, findings)
+    chosen = _choose(found, _limit(spec), last, episodes)
+    _play(data, chosen, found, metadata, workers, report, findings)
+    report.findings = findings.all()
+    return report
+
+
+def _limit(spec: str | None) -> int | None:
+    """Return the time limit that an EnvSpec (JSON) names, if it does."""
+    try:
+        limit = json.loads(spec or "null")["max_episode_steps"]
+    except (TypeError, KeyError, ValueError, RecursionError):
+        return None
+    return limit if isinstance(limit, int) and limit > 0 else None
+
+
+def _counts(metadata: dict[str, Any], dataset_id: str, found: Survey, findings: Findings) -> None:
+    for key, count in (("total_steps", found.steps), ("total_episodes", len(found.lengths))):
+        if metadata.get(key) != count:
+            findings.add("counts", "metadata", f"{key} is {metadata.get(key)}, the data have {count}")
+    if metadata.get("dataset_id") != dataset_id:
+        findings.add("metadata", "metadata", f"it calls itself {metadata.get('dataset_id')!r}")
+
+
+def _play(
+    data: Any,
+    chosen: Sequence[int],
+    found: Survey,
+    metadata: dict[str, Any],
+    workers: int,
+    report: Report,
+    findings: Findings,
+) -> None:
+    """Play the chosen episodes again, by the strictest means that each allows."""
+    spec = metadata.get("env_spec")
+    if not spec:
+        report.skipped.append("playing episodes again: the dataset names no environment")
+        return
+    if not chosen or not _same_spaces(spec, data, report, findings):
+        return
+    made, here = recorded_mujoco(metadata), versions()["mujoco"]
+    exact = made == here
+    if made is not None and not exact:
+        report.warnings.append(f"recorded with mujoco {made}, installed is {here}: compared within a tolerance")
+    last_unknown = minari_store.provenance(metadata).get("final_observations") == "repeated"
+    steps = sum(found.lengths[i] for i in chosen)
+    names = [int(data.episode_indices[i]) for i in chosen]
+    with Rollouts(spec, workers if workers > 1 and steps > FEW else 0) as rollouts:
+
+        def replay(spec: str, episodes: Iterable[Recorded]) -> list[Verdict]:
+            jobs = [rollouts.call(check, spec, e, exact, last_unknown and bool(e.terminations[-1])) for e in episodes]
+            return [result(job) for job in jobs]
+
+        rule = recorded_margin(metadata)
+        if rule is None and margins_matter(spec):
+            some = list(episodes_of(data, names[:: max(1, len(names) // SOME)]))
+            off = {rule: sum(bool(v.faults) for v in replay(with_margin(spec, rule), some)) for rule in SINCE}
+            rule = min(off, key=off.__getitem__)
+            if off[EARLIER] != off[ADDED]:
+                report.warnings.append(
+                    f"recorded with the contact margins of MuJoCo {SINCE[rule]}, as {counted(len(some), 'episode')} "
+                    f"show, and its metadata do not tell: add {REQUIREMENT[rule]!r} to its requirements, so that "
+                    "policies are evaluated with them"
+                )
+        verdicts = replay(with_margin(spec, rule or EARLIER), episodes_of(data, names))
+    _tell(verdicts, made if exact else None, report, findings)
+
+
+def _same_spaces(spec: str, data: Any, report: Report, findings: Findings) -> bool:
+    """Return whether the environment can be made and has the dataset's spaces; say what hinders it."""
+    try:
+        env = believed_env(spec, "playing episodes again")
+    except OffbenchError as error:
+        report.skipped.append(str(error))
+        return False
+    theirs: Any = env.action_space
+    same = env.observation_space.shape == data.observation_space.shape and theirs.shape == data.action_space.shape
+    same = same and bool((theirs.low == data.action_space.low).all() and (theirs.high == data.action_space.high).all())
+    env.close()
+    if not same:
+        findings.add("other-spaces", "metadata", f"{env.observation_space} and {theirs}")
+    return same
+
+
+def _choose(found: Survey, limit: int | None, last: Sequence[int], episodes: int) -> list[int]:
+    """Return the episodes to play again: a random sample, the last of each part, and those that end at the limit."""
+    sound = [i for i, good in enumerate(found.sound) if good]
+    if not sound or episodes < 1:
+        return []
+    rng = seeds.generator(0, Purpose.SAMPLE)
+    sample = rng.choice(sound, min(episodes, len(sound)), replace=False).tolist()
+    suspects = [i for i in sound if found.lengths[i] == limit and found.ended[i][0]][:episodes]
+    return sorted({*sample, *suspects, *(i for i in last if found.sound[i])})
+
+
+def _tell(verdicts: Sequence[Verdict], mujoco: str | None, report: Report, findings: Findings) -> None:
+    ways = {
+        "seed": f"from their seeds, {f'bit for bit (mujoco {mujoco})' if mujoco else 'within a tolerance'}",
+        "step": "one step at a time from recorded states",
+    }
+    for how, words in ways.items():
+        played = [verdict for verdict in verdicts if verdict.how == how]
+        if played:
+            steps = sum(verdict.steps for verdict in played)
+            report.checked.append(f"{counted(len(played), 'episode')} played again {words}: {counted(steps, 'step')}")
+    left = sum(verdict.how == "none" for verdict in verdicts)
+    if left:
+        words = f"playing {counted(left, 'episode')} again"
+        report.skipped.append(f"{words}: no seed, and no state to be set from observations")
+    for verdict in verdicts:
+        for code, detail in verdict.faults:
+            findings.add(code, f"episode {verdict.index}", detail)

@@ -1,0 +1,376 @@
+"""A grid: what it says, what it costs, how it goes on, and how it is shared."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import offbench
+from offbench.analysis.normalize import score_runs
+from offbench.benchmarks.benchmark import LocalExecutor, benchmark, shared
+from offbench.benchmarks.grid import load_grid, shipped_grids
+from offbench.benchmarks.plan import Plan, prepare
+from offbench.benchmarks.throughput import operations
+from offbench.cli.main import main
+from offbench.common.errors import OffbenchError
+from offbench.common.settings import fields as settings_of
+from offbench.data import minari_store
+from offbench.envs.recipes import load_recipe
+from offbench.training.jobs import Job
+from offbench.training.registry import load_algorithm
+from offbench.training.run import Run, find_runs
+from tests.made_runs import made_run
+from tests.speed.arithmetic import ALGORITHMS
+
+Cli = Callable[..., subprocess.CompletedProcess[str]]
+GRID = """
+datasets = ["DATASET"]
+seeds = 2
+steps = 200
+eval_every = 100
+eval_episodes = 2
+
+[[algorithms]]
+name = "td3_bc"
+hidden = [16, 16]
+batch_size = 32
+
+[[algorithms]]
+name = "bdb"
+hidden = [16, 16]
+batch_size = 32
+beta = [0.5, "adaptive"]
+seeds = [7]
+steps = 100
+"""
+
+
+@pytest.fixture
+def grid(medium: str, home: Path) -> str:
+    """A grid file on the tiny dataset: two runs of TD3+BC, two of BDB."""
+    (home / "grid.toml").write_text(GRID.replace("DATASET", medium))
+    return "./grid.toml"
+
+
+def silent(_: str) -> None:
+    """Take a line of the plan and drop it."""
+
+
+def test_the_papers_grid_is_its_table() -> None:
+    """15 datasets x (TD3+BC, CQL, four BDB) x 5 seeds = 450 runs of a million updates."""
+    bench = prepare("paper", workers=1)
+    assert sum(len(bench.orders(one)) for one in bench.variants) == 450
+    assert {one.times.steps for one in bench.variants} == {1_000_000}
+    assert {one.times.eval_every for one in bench.variants} == {5_000}
+    assert [one.name for one in bench.variants] == [
+        "td3_bc",
+        "bdb beta=0.25",
+        "bdb beta=0.5",
+        "bdb beta=0.75",
+        "bdb",
+        "cql eval_samples=10",
+    ]
+    assert {source.env for source in bench.grid.datasets} == {"hopper", "halfcheetah", "walker2d"}
+    assert {source.level for source in bench.grid.datasets} == set(offbench.inventory()["levels"])
+
+
+@pytest.mark.parametrize("name", shipped_grids())
+def test_shipped_grids_are_sound_and_their_plan_counts_what_is_left(name: str) -> None:
+    bench = prepare(name, workers=2)
+    first, *lines = Plan(bench)
+    runs = sum(len(bench.orders(one)) for one in bench.variants)
+    datasets = len(bench.grid.datasets)
+    words = "1 dataset" if datasets == 1 else f"{datasets} datasets"
+    assert first == f"{name}: {words}, {len(bench.variants)} variants, {runs} runs, {runs} to train"
+    assert any("to record first" in line for line in lines)
+    assert "on 2 processes of one thread about" in lines[-2]
+    assert "on a GPU: not measured here" in lines[-1]
+
+
+@pytest.mark.parametrize(("algorithm", "settings"), [("td3_bc", {}), ("bdb", {}), ("cql", {"bc_steps": 0})])
+def test_the_plans_operations_are_those_counted_by_hand(algorithm: str, settings: dict[str, Any]) -> None:
+    config = load_algorithm(algorithm).Config(**settings)
+    by_hand = ALGORITHMS[algorithm](11, 3, config.batch_size, config.hidden)
+    wanted = sum(often * 2 * np.prod([float(size) for size in product]) for often, product in by_hand)
+    counted = operations(algorithm, config, load_recipe("hopper").env_spec())
+    assert counted == pytest.approx(wanted, rel=1e-9)
+
+
+def test_a_finished_grid_is_left_alone(grid: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert benchmark(prepare(grid, workers=1), say=silent)
+    runs = find_runs(home / "runs")
+    assert {(r.config()["algorithm"], r.config()["seed"], r.config()["steps"]) for r in runs} == {
+        ("td3_bc", 0, 200),
+        ("td3_bc", 1, 200),
+        ("bdb", 7, 100),
+    }
+    assert len(runs) == 4
+    before = {run.folder: run.policy_path.stat().st_mtime_ns for run in runs}
+    main(["benchmark", grid, "--workers", "1"])
+    assert {run.folder: run.policy_path.stat().st_mtime_ns for run in runs} == before
+    said = capsys.readouterr().out
+    assert "4 runs, 0 to train" in said
+    assert "bdb" in said.splitlines()[-2]  # the paper's order: td3_bc, cql, bdb
+    assert "different steps" in said.splitlines()[-1]  # 200 updates and 100
+
+
+def test_the_table_is_of_the_grids_runs(grid: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert benchmark(prepare(grid, workers=1), say=silent)
+    other = made_run(home / "runs", "hopper-medium-v0", "cql", "default", 0, 50)
+    main(["benchmark", grid, "--workers", "1"])
+    said = capsys.readouterr().out
+    assert "bdb" in said
+    assert "hopper-medium-v0" not in said
+    assert other.evaluations()
+
+
+def test_missing_datasets_are_recorded_first(home: Path) -> None:
+    text = GRID.replace('"DATASET"', '{id = "mine-v0", env = "inverted-pendulum", level = "random", steps = 500}')
+    (home / "grid.toml").write_text(text)
+    assert benchmark(prepare("./grid.toml", workers=1), say=silent)
+    assert minari_store.read_metadata("mine-v0")["total_steps"] == 500
+
+
+def test_a_budget_stops_cleanly_and_the_same_call_goes_on(grid: str) -> None:
+    assert not benchmark(prepare(grid, workers=1), budget="0.001s", say=silent)
+    assert benchmark(prepare(grid, workers=1), budget="1h", say=silent)
+
+
+def test_a_budget_that_ends_before_any_training_begins_ends_the_command(grid: str, offbench_cli: Cli) -> None:
+    done = offbench_cli("benchmark", grid, "--budget", "0.001s", "--workers", "2", timeout=100)
+    assert done.returncode == 0, done.stderr
+    assert "the same command goes on" in done.stderr
+
+
+def test_a_budget_that_ends_before_any_evaluation_is_no_error(grid: str, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["benchmark", grid, "--budget", "0.001s", "--workers", "1"])
+    assert "the same command goes on" in capsys.readouterr().err
+
+
+def test_the_longest_training_begins_first(grid: str, home: Path) -> None:
+    """The grid's BDB runs, last in the file, take a hundred times TD3+BC's updates."""
+    text = (home / "grid.toml").read_text()
+    (home / "grid.toml").write_text(text.replace("steps = 100\n", "steps = 20000\n"))
+    begun: list[int] = []
+
+    class Idle(LocalExecutor):
+        def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
+            begun.extend(job.schedule.steps for job in jobs)
+            return []
+
+    assert not benchmark(prepare(grid, workers=2), executor=Idle(), say=silent)
+    assert begun == sorted(begun, reverse=True)
+    assert set(begun) == {200, 20_000}
+
+
+def test_shards_share_the_runs_and_together_are_the_grid(grid: str, home: Path) -> None:
+    """Machines that differ, too: the shares are the grid's, and a run's bits do not depend on its stack."""
+    benchmark(prepare(grid, workers=1, runs="whole"), say=silent)
+    for place in range(3):
+        benchmark(prepare(grid, workers=1 + place, runs="shared"), shard=(place, 3), say=silent)
+        counted = len([run for run in find_runs(home / "shared") if run.evaluations()])
+        assert counted == (2, 3, 4)[place]  # two runs of each of two variants, dealt to three
+    for run in find_runs(home / "whole"):
+        other = Run(home / "shared" / run.folder.relative_to(home / "whole"))
+        assert run.evaluations() == other.evaluations()
+        assert run.policy_path.read_bytes() == other.policy_path.read_bytes()
+
+
+@pytest.mark.parametrize("count", [2, 7, 16])
+def test_shares_of_the_papers_grid_are_even_and_leave_none_out(count: int) -> None:
+    bench = prepare("paper", workers=1)
+    whole = sorted(order.folder for one in bench.variants for order in bench.orders(one))
+    shares = [[order.folder for orders in shared(bench, (i, count)) for order in orders] for i in range(count)]
+    assert sorted(folder for share in shares for folder in share) == whole
+    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+    for i in range(count):
+        of_each = [len(orders) for orders in shared(bench, (i, count))]
+        assert max(of_each) - min(of_each) <= 1  # some of every algorithm
+
+
+def test_a_recipe_is_found_beside_its_grid_then_from_here(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (home / "mine").mkdir()
+    text = GRID.replace('"DATASET"', '{id = "tank-v0", env = "tank.toml"}, {id = "pool-v0", env = "envs/pool.toml"}')
+    (home / "mine" / "grid.toml").write_text(text)
+    (home / "mine" / "tank.toml").touch()
+    (home / "tank.toml").touch()
+    assert [source.env for source in load_grid("mine/grid.toml").datasets] == ["mine/tank.toml", "envs/pool.toml"]
+    monkeypatch.chdir("mine")
+    assert load_grid("grid.toml").datasets[0].env == "tank.toml"
+
+
+def test_layers_may_be_written_as_folders_name_them(grid: str, home: Path) -> None:
+    (home / "grid.toml").write_text((home / "grid.toml").read_text().replace("[16, 16]", '"16x16"'))
+    assert {one.config.hidden for one in prepare(grid, workers=1).variants} == {(16, 16)}
+
+
+BAD: dict[str, tuple[str, str]] = {
+    "no TOML": ("datasets = [", "not a readable TOML file"),
+    "no datasets": ('datasets = []\n[[algorithms]]\nname = "bc"', "datasets must be a list"),
+    "no algorithms": ('datasets = ["a-v0"]', "algorithms must be a list"),
+    "unknown key": ('datasets = ["a-v0"]\nstep = 3\n[[algorithms]]\nname = "bc"', "did you mean 'steps'"),
+    "bad seeds": (
+        'datasets = ["a-v0"]\nseeds = [1, 1]\n[[algorithms]]\nname = "bc"',
+        "seeds must be a count or a list",
+    ),
+    "half a seed": (
+        'datasets = ["a-v0"]\nseeds = 1.5\n[[algorithms]]\nname = "bc"',
+        "seeds must be a count or a list",
+    ),
+    "seeds on a day": (
+        'datasets = ["a-v0"]\nseeds = 2026-01-01\n[[algorithms]]\nname = "bc"',
+        "seeds must be a count or a list",
+    ),
+    "a seed too many": (
+        'datasets = ["a-v0"]\nseeds = 1000000000000\n[[algorithms]]\nname = "bc"',
+        "seeds must be a count or a list",
+    ),
+    "a number of 5000 digits": (f'datasets = ["a-v0"]\nsteps = {"1" * 5000}', "not a readable TOML file"),
+    "no seeds": ('datasets = ["a-v0"]\nseeds = 0\n[[algorithms]]\nname = "bc"', "seeds must be a count or a list"),
+    "bad steps": ('datasets = ["a-v0"]\nsteps = 0\n[[algorithms]]\nname = "bc"', "steps must be at least 1"),
+    "bad id": ('datasets = ["a"]\n[[algorithms]]\nname = "bc"', "is not a dataset id"),
+    "twice": ('datasets = ["a-v0"]\n[[algorithms]]\nname = "bc"\n[[algorithms]]\nname = "bc"', "comes twice"),
+    "dataset twice": ('datasets = ["a-v0", "a-v0"]\n[[algorithms]]\nname = "bc"', "a dataset comes twice"),
+    "no name": ('datasets = ["a-v0"]\n[[algorithms]]\nbeta = 1', "needs a name"),
+    "unknown algorithm": ('datasets = ["a-v0"]\n[[algorithms]]\nname = "td3bc"', "did you mean 'td3_bc'"),
+    "unknown setting": ('datasets = ["a-v0"]\n[[algorithms]]\nname = "bdb"\nbta = 1', "did you mean 'beta'"),
+    "bad level": (
+        'datasets = [{id = "a-v0", env = "hopper", level = "medim"}]\n[[algorithms]]\nname = "bc"',
+        "'medium'",
+    ),
+    "unknown source": ('datasets = ["strange-v0"]\n[[algorithms]]\nname = "bc"', "strange-v0"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_a_bad_grid_is_one_line(fault: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, message = BAD[fault]
+    (home / "grid.toml").write_text(text)
+    with pytest.raises(SystemExit) as end:
+        main(["benchmark", "./grid.toml"])
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["papr"], "did you mean 'paper'"),
+        (["./nothing.toml"], "no grid file"),
+        (["smoke", "--budget", "9"], "a budget is a time"),
+        (["smoke", "--budget=-9m"], "a budget must be more than nothing"),
+        (["smoke", "--shard", "3"], "no share like 0/4"),
+        (["smoke", "--stack", "0"], "whole number from 1"),
+    ],
+)
+def test_bad_words_are_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["benchmark", *words])
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_shard_beyond_the_last_is_refused(grid: str) -> None:
+    with pytest.raises(OffbenchError, match="a shard is i/n"):
+        benchmark(prepare(grid, workers=1), shard=(2, 2), say=silent)
+
+
+@pytest.mark.parametrize(
+    ("text", "env", "level"),
+    [
+        ("hopper-medium-replay-v0", "hopper", "medium-replay"),
+        ("inverted-pendulum-60percent-v0", "inverted-pendulum", "0.6"),
+        ("hopper-medium-v2", "", ""),  # D4RL's: ours has another version
+        ("hopper-12p5percent-v0", "hopper", "0.125"),
+        ("D4RL/hopper/medium-v2", "", ""),
+    ],
+)
+def test_an_id_tells_how_it_is_recorded(text: str, env: str, level: str, home: Path) -> None:
+    (home / "grid.toml").write_text(f'datasets = ["{text}"]\n[[algorithms]]\nname = "bc"')
+    (source,) = load_grid("./grid.toml").datasets
+    assert (source.env, source.level) == (env, level)
+
+
+@pytest.mark.slow
+def test_smoke_survives_five_kill_9(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed at random moments, recordings and trainings: the table is an undisturbed one's."""
+
+    def table(place: str) -> list[dict[str, Any]]:
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(home / place / "minari"))
+        return score_runs(home / place / "runs")
+
+    def command(place: str) -> list[str]:
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(home / place / "minari"))
+        return [sys.executable, "-m", "offbench", "benchmark", "smoke", "--runs", f"{place}/runs", "--workers", "2"]
+
+    began = time.monotonic()
+    subprocess.run(command("whole"), check=True, capture_output=True)
+    took, rng, kills, undisturbed = time.monotonic() - began, random.Random(0), 0, table("whole")
+    while kills < 5:  # the fifth may come in a second grid
+        shutil.rmtree(home / "killed", ignore_errors=True)
+        done = False
+        while not done:
+            process = subprocess.Popen(command("killed"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            try:
+                done = process.wait(rng.uniform(0.15, 0.7) * took if kills < 5 else None) == 0
+                assert done
+            except subprocess.TimeoutExpired:
+                process.send_signal(signal.SIGKILL)
+                process.wait()
+                kills += 1
+                time.sleep(1.5)  # its workers notice within a second that it is gone
+        assert json.dumps(table("killed")) == json.dumps(undisturbed)
+
+
+def test_a_run_that_diverged_before_is_said_and_left_alone(grid: str, home: Path) -> None:
+    assert benchmark(prepare(grid, workers=1), say=silent)
+    run = find_runs(home / "runs")[0]
+    run.mark_diverged(100, "critic.flat")
+    said: list[str] = []
+    assert benchmark(prepare(grid, workers=1), say=said.append)
+    assert (
+        said[-1] == f"{run.folder.relative_to(home)} has diverged before and is left as it is; delete it to try again"
+    )
+
+
+def test_a_list_is_a_variant_for_each_value_of_any_setting(tmp_path: Path) -> None:
+    """Also of settings that runs of one stack cannot differ in; a list that is one value stays one."""
+    grid = tmp_path / "grid.toml"
+    settings = (
+        'beta = [0.5, "adaptive"]\nbatch_size = [16, 32]\nhidden = [[8, 8], [16]]\ndiscriminator_hidden = [4, 4]'
+    )
+    grid.write_text(f'datasets = ["hopper-medium-v0"]\n[[algorithms]]\nname = "bdb"\n{settings}')
+    found = {(v.config.beta, v.config.batch_size, v.config.hidden) for v in prepare(str(grid)).variants}
+    assert found == set(itertools.product((0.5, "adaptive"), (16, 32), ((8, 8), (16,))))
+    assert {v.config.discriminator_hidden for v in prepare(str(grid)).variants} == {(4, 4)}
+
+
+def test_values_that_make_separate_stacks_train_in_one_command(medium: str) -> None:
+    sizes = {"steps": 20, "eval_every": 20, "eval_episodes": 1, "hidden": (8,), "workers": 1}
+    folders = offbench.train("td3_bc", medium, batch_size=[8, 16], **sizes)
+    assert [folder.parent.name for folder in folders] == ["batch_size=8,hidden=8", "batch_size=16,hidden=8"]
+    assert all((folder / "policy.safetensors").exists() for folder in folders)
+
+
+def test_help_lists_the_words_that_a_setting_may_be(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["train", "bdb", "--help"])
+    assert stopped.value.code == 0
+    said = " ".join(capsys.readouterr().out.split())
+    for name, field in settings_of(load_algorithm("bdb").Config).items():
+        if words := field.metadata["choices"]:
+            assert f"({' | '.join(words)}; default: {field.default})" in said, name
+    assert "(default: 256,256)" in said

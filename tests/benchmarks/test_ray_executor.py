@@ -1,0 +1,137 @@
+"""A benchmark on a real Ray cluster of two nodes: the same results as on this machine, whatever dies."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from offbench.benchmarks import ray_executor
+from offbench.benchmarks.benchmark import benchmark
+from offbench.benchmarks.grid import load_grid
+from offbench.benchmarks.plan import prepare
+from offbench.common.errors import OffbenchError
+from offbench.training.grouping import cut, pending
+from offbench.training.jobs import Order
+from offbench.training.run import Run, find_runs
+from offbench.training.trainer import Schedule
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
+
+GRID = """
+seeds = 2
+eval_every = 500
+eval_episodes = 2
+datasets = [{id = "mine-v0", env = "inverted-pendulum", level = "medium", steps = 1_000}]
+
+[[algorithms]]
+name = "bdb"
+steps = 3_000
+hidden = [32, 32]
+"""
+
+
+@pytest.fixture
+def two_nodes(home: Path) -> Iterator[Any]:
+    """A head without processors and two nodes with one each; yields (cluster, nodes)."""
+    import ray
+    from ray.cluster_utils import Cluster
+
+    (home / "grid.toml").write_text(GRID)
+    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    try:
+        workers = [nodes.add_node(num_cpus=1) for _ in range(2)]
+        ray.init(address=nodes.address, log_to_driver=False)
+        yield nodes, workers
+    finally:
+        ray.shutdown()
+        nodes.shutdown()
+
+
+def run(where: str, executor: Any) -> bool:
+    bench = prepare("./grid.toml", runs=where, workers=2, stack=1, device="cpu")
+    return benchmark(bench, executor=executor, say=lambda line: None)
+
+
+def same(home: Path, ours: str, theirs: str) -> None:
+    runs = find_runs(home / ours)
+    assert len(runs) == 2
+    for one in runs:
+        other = Run(home / theirs / one.folder.relative_to(home / ours))
+        assert one.evaluations_path.read_bytes() == other.evaluations_path.read_bytes()
+        assert one.policy_path.read_bytes() == other.policy_path.read_bytes()
+        newest = "checkpoint-000003000.safetensors"
+        assert (one.folder / newest).read_bytes() == (other.folder / newest).read_bytes()
+
+
+def test_a_lost_node_changes_nothing(two_nodes: Any, home: Path) -> None:
+    """Slices of two seconds; a node is killed while both are at work, and another one joins."""
+    nodes, workers = two_nodes
+    assert run("local", None)
+    executor = ray_executor.RayExecutor(nodes.address, slice_seconds=2)
+    with ThreadPoolExecutor(1) as beside:  # Ray starts and ends its nodes in the main thread alone
+        over = beside.submit(run, "ray", executor)
+        while not any((home / "ray").rglob("checkpoint-*")) and not over.done():
+            time.sleep(0.1)
+        assert not over.done()
+        nodes.remove_node(workers[0], allow_graceful=False)
+        nodes.add_node(num_cpus=1, wait=False)
+        assert over.result()
+    nodes.wait_for_nodes(60)  # the one that joined among them
+    assert len(nodes.list_all_nodes()) == 3
+    same(home, "local", "ray")
+
+
+def test_a_slice_begins_when_its_task_does(home: Path, medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task dealt out a minute ago, with slices of half a minute, trains to its end all the same."""
+    held = SimpleNamespace(remote=lambda **_: lambda task: SimpleNamespace(remote=lambda *words: (task, words)))
+    executor = object.__new__(ray_executor.RayExecutor)
+    executor.ray, executor.slice, executor._retried = held, 30.0, {}
+    executor.shelf = SimpleNamespace(report=SimpleNamespace(remote=lambda *_: None))
+    order = Order("td3_bc", medium, {"hidden": (16, 16)}, 0, str(home / "runs" / medium / "td3_bc/default/seed-0"))
+    schedule = Schedule(1_000, 1_000, 1, "cpu", workers=0)
+    (job,) = pending(cut([order], "cpu", 1, 1)[0], schedule)
+    with ray_executor._token(home) as token:
+        with monkeypatch.context() as patched:
+            patched.setattr(ray_executor, "time", SimpleNamespace(time=lambda: time.time() - 60))
+            task, words = executor._start(job, 0, token)
+        assert task(*words) == (True, [])
+    assert not ray_executor.left(job)
+
+
+def test_nodes_that_share_no_disk_fetch_and_bring_back(
+    two_nodes: Any, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The token's content is not what the nodes find: as on a node with another disk at the same path."""
+    import shutil
+
+    nodes, _ = two_nodes
+    assert run("local", None)
+    shutil.rmtree(home / "minari")  # to be recorded on a node as well
+
+    @contextmanager
+    def foreign(folder: Path) -> Iterator[str]:
+        yield f"{folder}/no-such-token\n"
+
+    monkeypatch.setattr(ray_executor, "_token", foreign)
+    assert run("ray", ray_executor.RayExecutor(nodes.address, slice_seconds=2))
+    same(home, "local", "ray")
+
+
+def test_what_fails_on_a_node_is_said_here(two_nodes: Any, home: Path) -> None:
+    nodes, _ = two_nodes
+    (home / "grid.toml").write_text(GRID.replace('env = "inverted-pendulum"', 'env = "./gone.toml"'))
+    source = load_grid("./grid.toml").datasets
+    with pytest.raises(OffbenchError, match="no recipe file"):
+        ray_executor.RayExecutor(nodes.address).record(source, 1)
+
+
+def test_a_cluster_that_is_not_there_is_one_line() -> None:
+    with pytest.raises(OffbenchError, match="no Ray cluster at"):
+        ray_executor.RayExecutor("127.0.0.1:1")

@@ -1,0 +1,64 @@
+"""The time left: by hand, where all steps cost the same and where they do not."""
+
+from __future__ import annotations
+
+import io
+import time
+
+import pytest
+
+from offbench.common import progress
+from offbench.training.jobs import Board, Job, Order
+from offbench.training.trainer import Schedule
+
+
+class Clock:
+    """Seconds that pass when told to."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(time, "monotonic", made)
+    return made
+
+
+def job(algorithm: str, runs: int, steps: int, cost: float) -> Job:
+    orders = tuple(Order(algorithm, "x-v0", {}, seed, "") for seed in range(runs))
+    return Job(algorithm, orders, Schedule(steps, 100, 1, "cpu", workers=0), cost=cost)
+
+
+def last_line(capsys: pytest.CaptureFixture[str]) -> str:
+    return capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_what_is_slow_is_still_to_come(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with Board([job("td3_bc", 2, 1000, 0.1), job("cql", 1, 100, 3.0)]) as board:
+        board.heard(0, 0, "")
+        clock.now = 100.0
+        board.heard(0, 1000, "")
+        # 2000 updates of 0.1 in 100 s: 2 units of work a second, and 300 are left
+        assert last_line(capsys) == "3 runs: 2,000/2,100 steps, 20 steps/s, 2 min 30 s left"
+        clock.now = 200.0
+        board.heard(1, 50, "score 7")  # gone on from there: 150 of the 300 were done before
+        clock.now = 250.0
+        board.heard(1, 60, "")
+        # 230 units in 250 s, 120 left
+        assert last_line(capsys) == "3 runs: 2,060/2,100 steps, 8 steps/s, 2 min 10 s left, score 7"
+
+
+def test_a_terminal_shows_the_same(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: True)
+    monkeypatch.setattr("sys.stderr", screen)
+    with progress.Progress(1000, "recording") as bar:
+        clock.now = 10.0
+        bar.to(100, "score 3")
+    assert "recording:  10%" in screen.getvalue()
+    assert "100/1.00k [" in screen.getvalue()
+    assert "1 min 30 s left, score 3]" in screen.getvalue()

@@ -1,0 +1,121 @@
+"""Dataset cards: what they claim is what `collect` records, bit for bit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import offbench
+from offbench.common.errors import OffbenchError
+from offbench.common.files import read_json
+from offbench.common.provenance import versions
+from offbench.data import minari_store
+from offbench.data.card import card, compare
+from offbench.data.levels import LEVELS
+from offbench.envs.recipes import load_recipe, names
+
+CARDS = [name for name in names() if (load_recipe(name).folder or Path()).joinpath("card.json").exists()]
+
+
+def shipped(name: str) -> Path:
+    folder = load_recipe(name).folder
+    assert folder is not None
+    return folder
+
+
+def test_every_shipped_ladder_has_a_card() -> None:
+    assert [name for name in names() if (shipped(name) / "behaviour" / "ladder.json").exists()] == CARDS
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_levels_are_in_order(name: str) -> None:
+    levels = read_json(shipped(name) / "card.json")["levels"]
+    assert levels.keys() == LEVELS.keys()
+    means = [levels[level]["return"] for level in LEVELS]
+    assert means == sorted(means)
+    assert len(set(means)) == len(means)
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_the_readme_says_what_the_card_says(name: str) -> None:
+    text, known = (shipped(name) / "README.md").read_text(), read_json(shipped(name) / "card.json")
+    for level, facts in known["levels"].items():
+        assert f"| {level} | {facts['transitions']:,} | {facts['episodes']:,} | {facts['return']:,.1f} |" in text
+        for version, content in facts["content_sha256"].items():
+            assert f"| {level} | {version} | `{content}` |" in text
+    assert (shipped(name) / "card.png").stat().st_size < 300_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_level_recorded_at_full_size_has_the_cards_content(level: str, capfd: pytest.CaptureFixture[str]) -> None:
+    known = read_json(shipped("inverted-pendulum") / "card.json")
+    offbench.collect("inverted-pendulum", level)
+    found = minari_store.provenance(minari_store.read_metadata(f"inverted-pendulum-{level}-v0"))
+    same = {name: versions()[name] for name in known["versions"]} == known["versions"]
+    assert same, "the tests run with the versions of constraints.txt"
+    assert found["content_sha256"] == known["levels"][level]["content_sha256"][versions()["mujoco"]]
+    assert "content equal to the dataset card's, bit for bit" in capfd.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in CARDS if name != "inverted-pendulum"])
+def test_a_shipped_replay_has_the_cards_content(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """The other levels take minutes: `offbench collect` itself says for each whether it is the card's."""
+    offbench.collect(name, "medium-replay")
+    assert "content equal to the dataset card's, bit for bit" in capfd.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_card_is_made_from_the_five_levels(home: Path) -> None:
+    """Written anew it is the shipped one, but for the picture's bytes."""
+    with pytest.raises(
+        OffbenchError, match="inverted-pendulum-random-v0 is not recorded yet; first `offbench collect"
+    ):
+        card("inverted-pendulum")
+    for level in LEVELS:
+        offbench.collect("inverted-pendulum", level)
+    folder = card("inverted-pendulum", home / "card")
+    for name in ("card.json", "README.md"):
+        assert (folder / name).read_text() == (shipped("inverted-pendulum") / name).read_text()
+    assert (folder / "card.png").read_bytes().startswith(b"\x89PNG")
+    offbench.collect("inverted-pendulum", "random", steps=500, overwrite=True)
+    with pytest.raises(OffbenchError, match="is not the level that is shipped"):
+        card("inverted-pendulum")
+
+
+def test_another_content_is_said_with_the_likely_reason(home: Path) -> None:
+    recipe = replace(load_recipe("hopper"), folder=home)
+    assert compare(recipe, "medium", "abc") is None  # no card
+    here = versions()["mujoco"]
+    contents = {here: "abc", "3.4.9": "abe"}
+    known = {"versions": {"numpy": versions()["numpy"]}, "levels": {"medium": {"content_sha256": contents}}}
+    (home / "card.json").write_text(json.dumps(known))
+    assert compare(recipe, "60percent", "abc") is None  # no such level on it
+    assert compare(recipe, "medium", "abc") == "content equal to the dataset card's, bit for bit"
+    assert (
+        compare(recipe, "medium", "abe") == "content equal to the dataset card's, bit for bit"
+    )  # the earlier MuJoCo's
+    assert "made with the same versions: another processor" in str(compare(recipe, "medium", "abd"))
+    (home / "card.json").write_text(json.dumps(known | {"levels": {"medium": {"content_sha256": {"3.4.9": "abe"}}}}))
+    assert "differs from the dataset card's, made with mujoco 3.4.9" in str(compare(recipe, "medium", "abd"))
+    (home / "card.json").write_text(json.dumps(known | {"versions": {"numpy": "0.1"}}))
+    assert "differs from the dataset card's, made with numpy 0.1" in str(compare(recipe, "medium", "abd"))
+
+
+def test_an_environment_without_a_ladder_has_no_card() -> None:
+    with pytest.raises(OffbenchError, match="ant has no ladder to describe, shipped or in behaviour"):
+        card("ant")
+
+
+def test_an_environment_of_ones_own_has_a_card_too(tiny: tuple[str, str], home: Path) -> None:
+    recipe, behaviour_dir = tiny
+    for level in LEVELS:
+        offbench.collect(recipe, level, behaviour_dir=behaviour_dir, workers=1)
+    text = (card(recipe, home / "card", behaviour_dir) / "README.md").read_text()
+    levels = read_json(home / "card" / "card.json")["levels"]
+    assert f"| medium | {levels['medium']['transitions']:,} |" in text
+    assert f"every rung: `{behaviour_dir}/tiny/seed-0/ladder`." in text

@@ -1,0 +1,159 @@
+"""From episodes to transitions: T + 1 rows, truncation bootstraps, termination does not."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import h5py
+import numpy as np
+import pytest
+
+import offbench
+from offbench.common.errors import OffbenchError
+from offbench.data import minari_store, transitions
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+BOX = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+ACTIONS = gym.spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 10.0], np.float32))
+
+
+def foreign(name: str, episodes: list[dict[str, Any]], observations: Any = BOX, actions: Any = ACTIONS) -> str:
+    """Write a dataset with Minari's own function, as somebody else would."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        minari.create_dataset_from_buffers(
+            name,
+            [EpisodeBuffer(**episode) for episode in episodes],
+            observation_space=observations,
+            action_space=actions,
+            data_format="hdf5",
+        )
+    return name
+
+
+def episode(steps: int, start: float, terminated: bool, **changes: Any) -> dict[str, Any]:
+    ends = np.zeros(steps, bool)
+    ends[-1] = True
+    observations = start + np.arange(2 * (steps + 1), dtype=np.float64).reshape(-1, 2)
+    values = {
+        "observations": observations,
+        "actions": np.tile(np.array([[2.0, 0.0]], np.float32), (steps, 1)),
+        "rewards": start + np.arange(steps, dtype=np.float64),
+        "terminations": ends if terminated else np.zeros(steps, bool),
+        "truncations": np.zeros(steps, bool) if terminated else ends,
+        "infos": {},
+    }
+    return values | changes
+
+
+def test_rows_point_at_each_transitions_observation() -> None:
+    data = offbench.load(foreign("rows-v0", [episode(3, 0, True), episode(2, 100, False)]))
+    assert len(data) == 5
+    np.testing.assert_array_equal(data.rows, [0, 1, 2, 4, 5])
+    np.testing.assert_array_equal(data.observations[data.rows][:, 0], [0, 2, 4, 100, 102])
+    np.testing.assert_array_equal(data.observations[data.rows + 1][:, 0], [2, 4, 6, 102, 104])
+    np.testing.assert_array_equal(data.rewards, [0, 1, 2, 100, 101])
+    np.testing.assert_array_equal(data.ends, [3, 5])
+    np.testing.assert_array_equal(data.returns, [3, 201])
+
+
+def test_termination_masks_and_truncation_does_not() -> None:
+    data = offbench.load(foreign("masks-v0", [episode(3, 0, True), episode(2, 100, False)]))
+    np.testing.assert_array_equal(data.masks, [1, 1, 0, 1, 1])
+
+
+def test_actions_are_scaled_by_the_action_space() -> None:
+    actions = np.array([[-2.0, 0.0], [0.0, 5.0], [2.0, 10.0]], np.float32)
+    data = offbench.load(foreign("scale-v0", [episode(3, 0, True, actions=actions)]))
+    np.testing.assert_allclose(data.actions, [[-1, -1], [0, 0], [1, 1]])
+
+
+def test_actions_out_of_bounds_are_clipped_and_said(capsys: pytest.CaptureFixture[str]) -> None:
+    actions = np.array([[-3.0, 0.0], [0.0, 5.0]], np.float32)
+    data = offbench.load(foreign("clip-v0", [episode(2, 0, True, actions=actions)]))
+    assert data.actions.min() == -1
+    assert "1 actions out of bounds" in capsys.readouterr().err
+
+
+def test_the_normaliser_sees_transitions_alone(medium: str) -> None:
+    """std + 1e-3 over the observations that have an action, as TD3+BC's authors compute it."""
+    data = offbench.load(medium)
+    episodes = minari.load_dataset(medium).iterate_episodes()
+    states = np.concatenate([e.observations[:-1] for e in episodes]).astype(np.float32)
+    mean, std = data.normalizer()
+    np.testing.assert_allclose(mean, states.astype(np.float64).mean(0), atol=1e-6)
+    np.testing.assert_allclose(std, states.astype(np.float64).std(0) + 1e-3, rtol=1e-5)
+
+
+def test_the_second_load_maps_the_cache(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = offbench.load(medium)
+    monkeypatch.setattr(transitions, "_convert", None)  # would fail if it were called
+    second = offbench.load(medium)
+    assert isinstance(second.observations, np.memmap)
+    np.testing.assert_array_equal(first.observations, second.observations)
+
+
+def test_a_changed_dataset_is_converted_anew(tiny: tuple[str, str], medium: str) -> None:
+    recipe, behaviour_dir = tiny
+    before = offbench.load(medium).content
+    offbench.collect(recipe, "medium", behaviour_dir=behaviour_dir, workers=1, seed=9, overwrite=True)
+    assert offbench.load(medium).content != before
+
+
+BAD = {
+    "nan": ([episode(3, 0, True, rewards=np.array([0.0, np.nan, 1.0]))], "rewards hold NaN"),
+    "inf": ([episode(3, np.inf, True)], "observations hold NaN or infinite"),
+    "no-next": ([episode(3, 0, True, observations=np.zeros((3, 2)))], r"shape \(3, 2\), expected \(4, 2\)"),
+    "width": ([episode(3, 0, True, actions=np.zeros((3, 1), np.float32))], r"shape \(3, 1\), expected \(3, 2\)"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_data_are_refused(kind: str) -> None:
+    episodes, message = BAD[kind]
+    name = foreign(f"{kind}-v0", episodes)
+    with pytest.raises(OffbenchError, match=message):
+        offbench.load(name)
+    assert not list(transitions.cache().glob("*/meta.json"))
+
+
+def test_other_spaces_are_refused() -> None:
+    discrete = {"actions": np.zeros(3, np.int64)}
+    name = foreign("discrete-v0", [episode(3, 0, True, **discrete)], actions=gym.spaces.Discrete(2))
+    with pytest.raises(OffbenchError, match="actions must be a Box space, not Discrete"):
+        offbench.load(name)
+    unbounded = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    name = foreign("unbounded-v0", [episode(3, 0, True)], actions=unbounded)
+    with pytest.raises(OffbenchError, match="must be bounded"):
+        offbench.load(name)
+
+
+@pytest.mark.parametrize("fault", ["empty", "truncated", "no episodes", "metadata"])
+def test_damaged_files_are_a_clear_error(medium: str, fault: str) -> None:
+    folder = minari_store.path_of(medium) / "data"
+    file = folder / "main_data.hdf5"
+    if fault == "empty":
+        file.write_bytes(b"")
+    elif fault == "truncated":
+        file.write_bytes(file.read_bytes()[:3000])
+    elif fault == "no episodes":
+        with h5py.File(file, "a") as data:
+            del data["episode_1"]
+    else:
+        (folder / "metadata.json").write_text("{")
+    with pytest.raises(OffbenchError, match=r"damaged|cannot be read"):
+        offbench.load(medium)
+
+
+def test_a_dataset_without_references_trains_and_scores_nothing(home: Path) -> None:
+    name = foreign("plain-v0", [episode(40, 0, True), episode(30, 5, False)])
+    (folder,) = offbench.train("td3_bc", name, steps=20, eval_every=10, hidden=(8,), batch_size=4)
+    assert (folder / "policy.safetensors").exists()
+    assert not (folder / "evaluations.csv").read_text().splitlines()[1:]

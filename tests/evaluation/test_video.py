@@ -1,0 +1,182 @@
+"""`offbench video`: films of policies, where something can draw; the refusals, everywhere."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from offbench.common.errors import OffbenchError
+from offbench.envs.recipes import shipped
+from offbench.evaluation import renderer, video
+
+Cli = Callable[..., subprocess.CompletedProcess[str]]
+POLICY = next((shipped() / "inverted-pendulum" / "behaviour" / "policies").glob("*.safetensors"))
+
+
+@pytest.fixture(scope="module")
+def draws() -> None:
+    """Skip where nothing draws off-screen."""
+    if renderer.working_backend() is None:
+        pytest.skip("neither EGL nor OSMesa works here: no film was made")
+
+
+def frames_of(path: Path) -> list[np.ndarray]:
+    with Image.open(path) as film:
+        frames = []
+        for place in range(film.n_frames):
+            film.seek(place)
+            frames.append(np.asarray(film.convert("RGB")).astype(int))
+    return frames
+
+
+@pytest.mark.usefixtures("draws")
+def test_a_gif_shows_the_episode_with_step_and_return(offbench_cli: Cli, home: Path) -> None:
+    words = ("--seconds", "1", "--fps", "10", "--size", "120", "--out", "film.gif")
+    for _ in range(2):  # the same frames the second time
+        done = offbench_cli("video", str(POLICY), *words)
+        assert done.returncode == 0, done.stderr
+        frames = frames_of(home / "film.gif")
+        # 25 steps a second in InvertedPendulum (dt 0.04): every 2nd is drawn, the first and the last too
+        assert [frame.shape for frame in frames] == [(120, 120, 3)] * 14
+        assert np.abs(frames[0][:20] - frames[-1][:20]).max() > 100  # the text has changed
+        assert frames[0].std() > 10  # something is drawn
+    assert not list(home.glob(".film*"))
+
+
+@pytest.mark.usefixtures("draws")
+def test_an_mp4_is_a_film_of_its_frames(home: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed: no mp4 was made")
+    made = video.video("inverted-pendulum:expert", out="film.mp4", episodes=2, seconds=0.8, fps=25, size=96)
+    frames, seconds = ffmpeg.count_frames_and_secs(str(made))
+    assert frames == 21  # 20 steps and the first frame: --seconds counts for the whole film
+    assert seconds == pytest.approx(21 / 25, abs=0.05)
+
+
+@pytest.mark.usefixtures("draws")
+def test_a_film_of_a_run_plays_its_environment(medium: str, home: Path) -> None:
+    import offbench
+
+    (run,) = offbench.train("bc", medium, steps=2, eval_every=2, eval_episodes=1, hidden=(8,), workers=1)
+    made = video.video(run, out=home / "run.gif", seconds=0.2, size=64)
+    assert len(frames_of(made)) == 6
+
+
+def test_without_a_renderer_the_packages_are_named(monkeypatch: pytest.MonkeyPatch, home: Path) -> None:
+    monkeypatch.setattr(video, "working_backend", lambda: None)
+    with pytest.raises(OffbenchError, match=r"libegl1 .*libosmesa6"):
+        video.video(POLICY, out="film.gif")
+    assert not (home / "film.gif").exists()
+
+
+def test_a_backend_that_cannot_draw_is_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    monkeypatch.setattr(renderer, "BACKENDS", ("no-such-one",))
+    assert renderer.working_backend.__wrapped__() is None
+
+
+def test_the_users_choice_of_backend_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    with renderer.drawing_with("egl"):
+        assert os.environ["MUJOCO_GL"] == "egl"
+    assert os.environ["MUJOCO_GL"] == "glfw"
+    monkeypatch.delenv("MUJOCO_GL")
+    with renderer.drawing_with("osmesa"):
+        pass
+    assert "MUJOCO_GL" not in os.environ
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["hopper:medium", "--out", "film.avi"], ".gif or .mp4"),
+        (["hopper:medium-expert", "--out", "a.gif"], "not of one policy"),
+        (["hopper:medium-replay", "--out", "a.gif"], "not of one policy"),
+        (["hopper:mediun", "--out", "a.gif"], "did you mean 'medium'"),
+        (["hoper:medium", "--out", "a.gif"], "did you mean 'hopper'"),
+        (["ant:medium", "--out", "a.gif"], "no ladder"),
+        (["nothing", "--out", "a.gif"], "no policy file"),
+        ([str(POLICY), "--out", "new/a.gif"], "cannot write new/a.gif: there is no folder new"),
+        ([str(POLICY), "--env", "hopper", "--out", "a.gif"], "give the right one"),
+        ([str(POLICY), "--seconds", "0", "--out", "a.gif"], "more than 0"),
+        ([str(POLICY), "--fps", "0", "--out", "a.gif"], "whole number from 1"),
+    ],
+)
+def test_bad_input_is_one_line(words: list[str], text: str, offbench_cli: Cli, home: Path) -> None:
+    done = offbench_cli("video", *words)
+    assert done.returncode == 2, done.stdout
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert text in done.stderr
+    assert not list(home.glob("*.gif"))
+
+
+TANK = """
+import gymnasium as gym
+import numpy as np
+
+
+class Tank(gym.Env):
+    def __init__(self, **options):
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (4,))
+        self.action_space = gym.spaces.Box(-3.0, 3.0, (1,))
+        MODE
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(4, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(4, np.float32), 0.0, False, False, {}
+
+
+gym.register("Tank-v0", "tank:Tank", max_episode_steps=5)
+"""
+
+
+@pytest.mark.parametrize("mode", ["assert not options, options", "self.render_mode = options.get('render_mode')"])
+def test_an_environment_that_does_not_draw_is_one_line(mode: str, home: Path, offbench_cli: Cli) -> None:
+    (home / "tank.py").write_text(TANK.replace("MODE", mode))
+    (home / "tank.toml").write_text('env_id = "tank:Tank-v0"\n')
+    done = offbench_cli("video", str(POLICY), "--env", "./tank.toml")
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("offbench: Tank-v0 cannot be filmed")
+    if "render_mode" in mode:
+        assert line.endswith("it has no rgb_array rendering")
+    assert not list(home.glob("*.gif"))
+
+
+@pytest.mark.parametrize(
+    ("failure", "remedy"),
+    [
+        ("raise gym.error.DependencyNotInstalled('run `pip install pygame`')", "pip install pygame"),
+        ("import no_such_renderer", "no_such_renderer"),
+        ("raise RuntimeError", "RuntimeError"),
+    ],
+)
+def test_an_environment_without_its_renderer_is_one_line(
+    failure: str, remedy: str, home: Path, offbench_cli: Cli
+) -> None:
+    code = TANK.replace("MODE", "self.render_mode = options.get('render_mode')")
+    (home / "tank.py").write_text(
+        code.replace("    def step(", f"    def render(self):\n        {failure}\n\n    def step(")
+    )
+    (home / "tank.toml").write_text('env_id = "tank:Tank-v0"\n')
+    done = offbench_cli("video", str(POLICY), "--env", "./tank.toml")
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("offbench: Tank-v0 cannot be filmed")
+    assert remedy in line
+    assert not list(home.glob("*.gif"))
+
+
+def test_mp4_without_its_encoder_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(OffbenchError, match=r"offbench\[video\]"):
+        video.video(POLICY, out="film.mp4")

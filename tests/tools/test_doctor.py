@@ -1,0 +1,85 @@
+"""`offbench doctor` tells a sound machine from a broken one."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import pytest
+
+from offbench.common.provenance import versions
+from offbench.tools import doctor
+
+Cli = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def states(done: subprocess.CompletedProcess[str]) -> dict[str, set[str]]:
+    found: dict[str, set[str]] = {}
+    for row in json.loads(done.stdout):
+        found.setdefault(row["name"], set()).add(row["state"])
+    return found
+
+
+def test_a_sound_machine_has_nothing_broken(offbench_cli: Cli) -> None:
+    done = offbench_cli("doctor")
+    assert done.returncode == 0, done.stdout + done.stderr
+    for text in (f"mujoco {versions()['mujoco']}", "transitions replayed", "td3_bc", "GB free", "GB memory"):
+        assert text in done.stdout
+    assert "broken" not in done.stdout
+
+
+def test_folders_that_cannot_be_written_are_broken(offbench_cli: Cli, home: Path) -> None:
+    (home / "file").write_text("not a folder")
+    environment = dict(os.environ) | {
+        "MINARI_DATASETS_PATH": str(home / "file" / "minari"),
+        "OFFBENCH_CACHE": "/proc/x",
+    }
+    done = offbench_cli("doctor", "--json", env=environment)
+    assert done.returncode == 1
+    found = states(done)
+    assert found["datasets"] == found["cache"] == {"broken"}
+    assert found["physics"] == found["runs"] == {"ok"}
+
+
+def test_the_physics_check_sees_other_physics(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert doctor.replay_error(16) < 1e-5
+    make = gymnasium.make
+
+    def lighter(*args: object, **kwargs: object) -> gymnasium.Env:
+        env = make(*args, **kwargs)  # type: ignore[arg-type]
+        env.unwrapped.model.opt.gravity[2] *= 0.999  # type: ignore[attr-defined]
+        mujoco.mj_setConst(env.unwrapped.model, env.unwrapped.data)  # type: ignore[attr-defined]
+        return env
+
+    monkeypatch.setattr(gymnasium, "make", lighter)
+    assert doctor.replay_error(16) > 1e-5
+    monkeypatch.setattr(doctor, "TOLERANCE", 1e-5)
+    (finding,) = [f for f in doctor.doctor() if f.name == "physics"]
+    assert finding.state == "broken"
+    assert "mujoco" in finding.text
+
+
+def test_a_broken_algorithm_and_a_missing_package_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    from offbench.training import registry
+
+    monkeypatch.setattr(registry, "algorithm_names", lambda: ["td3_bc", "gone"])
+    monkeypatch.setattr(doctor, "versions", lambda: {"python": "3.11", "minari": "not installed"})
+    found = {(f.name, f.state): f.text for f in doctor.doctor()}
+    assert "gone" in found["algorithms", "broken"]
+    assert "td3_bc" in found["algorithms", "ok"]
+    assert "minari not installed" in found["versions", "broken"]
+
+
+def test_no_renderer_is_worth_a_note_and_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    from offbench.evaluation import renderer
+
+    monkeypatch.setattr(renderer, "working_backend", lambda: None)
+    (finding,) = [f for f in doctor.doctor() if f.name == "renderer"]
+    assert finding.state == "note"
+    assert "libegl1" in finding.text
+    assert "libosmesa6" in finding.text

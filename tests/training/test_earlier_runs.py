@@ -1,0 +1,59 @@
+"""Runs, policies and datasets written before the code was laid out in packages (commit 057d2b0) stay valid.
+
+tests/fixtures/earlier has a dataset of 60 steps, each algorithm's run after 20 of 40 updates, and the policies and
+losses after 40, all written by that commit on one AMD EPYC (AVX-512).
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import offbench
+from offbench.common.provenance import hardware
+from offbench.rollouts.policy import load_policy
+from offbench.training.run import find_runs
+from tests.conftest import ROOT
+
+EARLIER = ROOT / "tests" / "fixtures" / "earlier"
+SETTINGS = {"td3_bc": {}, "bdb": {"beta": "adaptive"}, "cql": {"bc_steps": 10}, "bc": {}}
+
+
+@pytest.mark.parametrize("algorithm", SETTINGS)
+def test_an_earlier_run_resumes_with_the_same_bits(algorithm: str, home: Path) -> None:
+    shutil.copytree(EARLIER / "minari", home / "minari")
+    shutil.copytree(EARLIER / "runs", home / "runs")
+    (run,) = offbench.train(
+        algorithm,
+        "pendulum-small-v0",
+        steps=40,
+        eval_every=20,
+        eval_episodes=1,
+        workers=1,
+        hidden=(8, 8),
+        batch_size=16,
+        **SETTINGS[algorithm],
+    )
+    config = json.loads((run / "config.json").read_text())
+    before = json.loads((EARLIER / "runs" / run.relative_to("runs") / "config.json").read_text())
+    assert config["settings"] == before["settings"]
+    now, then = load_policy(run / "policy.safetensors"), load_policy(EARLIER / "after" / f"{algorithm}.safetensors")
+    losses = (run / "losses.csv").read_text()
+    same = hardware()["hardware"]["vectors"] == before["hardware"]["vectors"]
+    for ours, theirs in zip(now.layers, then.layers, strict=True):
+        for a, b in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=0 if same else 1e-6)
+    if same:
+        assert losses == (EARLIER / "after" / f"{algorithm}-losses.csv").read_text()
+
+
+def test_earlier_runs_are_reported(home: Path) -> None:
+    shutil.copytree(EARLIER / "runs", home / "runs")
+    rows = offbench.normalize("runs")
+    assert {row["algorithm"] for row in rows} == set(SETTINGS)
+    assert all(row["steps"] == 20 and row["evaluations"] == 1 for row in rows)
+    assert len(find_runs(home / "runs")) == len(SETTINGS)

@@ -1,0 +1,178 @@
+"""Interrupted by Ctrl-C, SIGTERM or kill -9: a checkpoint where it stops, and the same bits after a resume."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from offbench.agents.behaviour import folder_of
+from offbench.cli.main import main
+from offbench.common import checkpoints
+from offbench.envs.recipes import load_recipe
+from offbench.training.run import Run, find_runs
+from offbench.training.stack import Stack
+from tests.training.test_resume import assert_same_files, train
+
+
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Let Ctrl-C work where the tests run in the background of a shell, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def kill_when(process: subprocess.Popen[bytes], ready: Any, delay: float) -> None:
+    """Send SIGKILL a while after `ready()` first holds."""
+    deadline = time.monotonic() + 120
+    while not ready() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(delay)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+@pytest.mark.slow
+def test_training_survives_kill_9(medium: str, home: Path) -> None:
+    words = ["train", "bdb", "--dataset", medium, "--steps", "1500", "--eval-every", "100", "--eval-episodes", "2"]
+    words += ["--hidden", "16,16", "--batch-size", "32", "--seeds", "0:2"]
+    command = [sys.executable, "-m", "offbench", *words]
+    wholes = train("bdb", medium, "whole", 1500, seeds=[0, 1])
+    folder = home / "killed" / medium / "bdb" / "batch_size=32,hidden=16x16"
+    kills = 0
+    for delay in (0.0, 0.05, 0.13, 0.21):
+        seen = set(checkpoints.steps(folder / "seed-0"))
+        process = subprocess.Popen(
+            [*command, "--runs", "killed"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        kill_when(process, lambda seen=seen: set(checkpoints.steps(folder / "seed-0")) - seen, delay)
+        kills += process.returncode == -signal.SIGKILL
+    assert kills >= 2
+    for killed, whole in zip(train("bdb", medium, "killed", 1500, seeds=[0, 1]), wholes, strict=True):
+        assert killed.folder.parent == folder.relative_to(home)
+        assert_same_files(killed, whole)
+
+
+@pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.usefixtures("ctrl_c")
+def test_ctrl_c_and_sigterm_save_a_checkpoint_where_they_arrive(
+    medium: str, sent: int, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train_on = Stack.train
+
+    def interrupted(stack: Stack, until: int) -> Iterator[int]:
+        for step in train_on(stack, until):
+            if step == 300:
+                signal.raise_signal(sent)
+            yield step
+
+    (whole,) = train("td3_bc", medium, "whole", 600, eval_every=200)
+    words = ["train", "td3_bc", "--dataset", medium, "--steps", "600", "--eval-every", "200", "--eval-episodes", "2"]
+    words += ["--workers", "1", "--hidden", "16,16", "--batch-size", "32"]
+    capsys.readouterr()
+    with monkeypatch.context() as patched:
+        patched.setattr(Stack, "train", interrupted)
+        with pytest.raises(SystemExit) as stopped:
+            main(words)
+    run = Run(Path("runs") / whole.folder.relative_to("whole"))
+    assert stopped.value.code == status
+    assert max(checkpoints.steps(run.folder)) == 300
+    assert sorted(run.evaluations()) == [200]
+    assert "stopped at step 300, checkpoint saved" in (said := capsys.readouterr().err)
+    assert "the same command goes on" in said
+    main(words)
+    assert "going on from step 300" in capsys.readouterr().err
+    assert_same_files(run, whole)
+
+
+@pytest.mark.usefixtures("ctrl_c")
+def test_a_second_ctrl_c_does_not_wait_for_a_checkpoint(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    train_on = Stack.train
+
+    def interrupted(stack: Stack, until: int) -> Iterator[int]:
+        for step in train_on(stack, until):
+            if step == 300:
+                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
+            yield step
+
+    monkeypatch.setattr(Stack, "train", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train("td3_bc", medium, "runs", 600, eval_every=200)
+    (run,) = find_runs(Path("runs"))
+    assert checkpoints.steps(run.folder) == [200]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sent", "status", "verb"), [(signal.SIGINT, 130, "train"), (signal.SIGTERM, 143, "benchmark")]
+)
+@pytest.mark.usefixtures("ctrl_c")
+def test_interrupted_worker_processes_save_checkpoints_too(
+    medium: str, home: Path, sent: int, status: int, verb: str
+) -> None:
+    """The whole process group gets the signal, as from a terminal, or from Slurm."""
+    every, steps = 500, 3000
+    settings = {"steps": steps, "eval_every": every, "eval_episodes": 2}
+    if verb == "train":
+        words = ["train", "td3_bc", "--dataset", medium, "--seeds", "0:2", "--hidden", "16,16", "--batch-size", "32"]
+        words += [word for key, value in settings.items() for word in (f"--{key.replace('_', '-')}", str(value))]
+    else:
+        lines = [f'datasets = ["{medium}"]', "seeds = 2", *(f"{key} = {value}" for key, value in settings.items())]
+        lines += ["[[algorithms]]", 'name = "td3_bc"', "hidden = [16, 16]", "batch_size = 32"]
+        (home / "grid.toml").write_text("\n".join(lines))
+        words = ["benchmark", "./grid.toml"]
+    command = [sys.executable, "-m", "offbench", *words, "--workers", "2"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    runs = [Run(home / f"runs/{medium}/td3_bc/batch_size=32,hidden=16x16/seed-{seed}") for seed in range(2)]
+    deadline = time.monotonic() + 120
+    while not any(checkpoints.steps(run.folder) for run in runs) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, sent)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == status
+    assert "leaked" not in errors
+    assert "Traceback" not in errors
+    assert "the same command goes on" in errors
+    newest = [max(there) for run in runs if (there := checkpoints.steps(run.folder))]
+    said = [int(number.replace(",", "")) for number in re.findall(r"stopped at step ([\d,]+)", errors)]
+    assert said
+    assert sorted(said) == sorted(newest)
+    more = {"seeds": [0, 1], "eval_every": every}
+    whole = train("td3_bc", medium, "whole", steps, **more)
+    for run, undisturbed in zip(train("td3_bc", medium, "runs", steps, **more), whole, strict=True):
+        assert_same_files(run, undisturbed)
+
+
+@pytest.mark.slow
+def test_behaviour_training_survives_kill_9(tiny: tuple[str, str], home: Path) -> None:
+    """The rungs, the transitions and the ladder equal those of an undisturbed training."""
+    recipe, behaviour_dir = tiny
+    whole = folder_of(load_recipe(recipe), 0, Path(behaviour_dir))
+    killed = folder_of(load_recipe(recipe), 0, home / "killed")
+    command = [sys.executable, "-m", "offbench", "behaviour", recipe, "--behaviour-dir", str(home / "killed")]
+    kills = 0
+    for delay in (0.0, 0.2, 0.4):
+        seen = set(checkpoints.steps(killed))
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        kill_when(process, lambda seen=seen: set(checkpoints.steps(killed)) - seen, delay)
+        kills += process.returncode == -signal.SIGKILL
+    assert kills >= 2
+    subprocess.run(command, check=True, capture_output=True)
+    for path in sorted((whole / "policies").iterdir()):
+        assert path.read_bytes() == (killed / "policies" / path.name).read_bytes()
+    assert (whole / "ladder" / "medium-replay.hdf5").exists()
+    ours, theirs = ((folder / "ladder" / "ladder.csv").read_text().splitlines() for folder in (whole, killed))
+    no_hours = [[cell for i, cell in enumerate(line.split(",")) if i != 1] for line in ours]
+    assert no_hours == [[cell for i, cell in enumerate(line.split(",")) if i != 1] for line in theirs]

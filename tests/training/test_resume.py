@@ -1,0 +1,301 @@
+"""Killed and resumed: the same bits as undisturbed, nothing lost, nothing twice."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import offbench
+from offbench.analysis.results import read_results
+from offbench.cli.main import main
+from offbench.common import checkpoints
+from offbench.common.errors import OffbenchError
+from offbench.training.registry import algorithm_names
+from offbench.training.run import Run
+
+SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 100, "eval_episodes": 2, "workers": 1}
+EXTRA: dict[str, dict[str, Any]] = {
+    "td3_bc": {},
+    "bdb": {},
+    "bc": {},
+    "cql": {"num_actions": 2, "bc_steps": 150, "eval_samples": 3},
+}
+
+
+def test_every_algorithm_is_tested_here() -> None:
+    assert set(EXTRA) == set(algorithm_names())
+
+
+def train(algorithm: str, dataset: str | list[str], runs: str, steps: int, **more: Any) -> list[Run]:
+    settings = SMALL | EXTRA[algorithm] | more
+    return [Run(path) for path in offbench.train(algorithm, dataset, steps=steps, runs=runs, **settings)]
+
+
+def assert_same_files(one: Run, other: Run) -> None:
+    for name in ("policy.safetensors", "evaluations.csv", "losses.csv"):
+        assert (one.folder / name).read_bytes() == (other.folder / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("algorithm", sorted(EXTRA))
+def test_a_run_stopped_and_resumed_ends_with_the_same_bits(medium: str, algorithm: str, precision: str) -> None:
+    (whole,) = train(algorithm, medium, "whole", 300, precision=precision)
+    assert whole.config()["precision"] == precision
+    for steps in (100, 200, 300):
+        (pieces,) = train(algorithm, medium, "pieces", steps, precision=precision)
+    assert whole.policy_path.read_bytes() == pieces.policy_path.read_bytes()
+    assert whole.evaluations_path.read_bytes() == pieces.evaluations_path.read_bytes()
+    ours, theirs = (load_file(run.folder / "checkpoint-000000300.safetensors") for run in (whole, pieces))
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_seeds_in_a_stack_stop_and_resume_too(medium: str) -> None:
+    whole = train("bdb", medium, "whole", 200, seeds=[0, 1, 2])
+    train("bdb", medium, "pieces", 100, seeds=[0, 1, 2])
+    pieces = train("bdb", medium, "pieces", 200, seeds=[0, 1, 2])
+    for a, b in zip(whole, pieces, strict=True):
+        assert a.policy_path.read_bytes() == b.policy_path.read_bytes()
+
+
+def test_a_run_alone_equals_the_same_run_in_a_stack(medium: str, precision: str) -> None:
+    """From the data to the weights: batches, noise and initial weights depend on the run's own seed alone."""
+    stack = train("bdb", medium, "stack", 200, seeds=[3, 4, 5], precision=precision)
+    for run in stack:
+        (alone,) = train("bdb", medium, "alone", 200, seeds=run.config()["seed"], precision=precision)
+        ours, theirs = (load_file(r.folder / "checkpoint-000000200.safetensors") for r in (run, alone))
+        for name in ours:
+            assert torch.equal(ours[name], theirs[name]), name
+
+
+def test_each_precision_has_runs_of_its_own(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("offbench.training.devices.has_bfloat16", lambda: True)
+    one, other = (train("td3_bc", medium, "runs", 100, precision=name)[0] for name in ("float32", "bfloat16"))
+    assert other.config()["variant"] == f"{one.config()['variant']},precision=bfloat16"
+    assert one.policy_path.read_bytes() != other.policy_path.read_bytes()
+    labels = [method.label for method in read_results("runs").methods]
+    assert labels == [f"td3_bc {run.config()['variant']}" for run in (one, other)]
+
+
+def test_a_precision_that_the_device_lacks_is_refused(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("offbench.training.devices.has_bfloat16", lambda: False)
+    for name, reason in {
+        "bfloat16": "this processor cannot",
+        "tf32": "use float32 on a CPU",
+        "half": "'half'",
+    }.items():
+        with pytest.raises(OffbenchError, match=reason):
+            train("td3_bc", medium, "runs", 100, precision=name)
+    assert not Path("runs").exists()
+
+
+def test_new_seeds_leave_finished_ones_alone(medium: str) -> None:
+    """Seed 0 is done, seed 1 is half way, seed 2 is new: each goes on from where it is, to its own bits."""
+    whole = train("td3_bc", medium, "whole", 200, seeds=[0, 1, 2])
+    (first,) = train("td3_bc", medium, "runs", 200, seeds=0)
+    train("td3_bc", medium, "runs", 100, seeds=1)
+    before = first.policy_path.stat().st_mtime_ns
+    for a, b in zip(whole, train("td3_bc", medium, "runs", 200, seeds=[0, 1, 2]), strict=True):
+        ours, theirs = (load_file(run.folder / "checkpoint-000000200.safetensors") for run in (a, b))
+        for name in ours:
+            assert torch.equal(ours[name], theirs[name]), name
+        assert b.evaluations().keys() == {100, 200}
+    assert first.policy_path.stat().st_mtime_ns == before
+
+
+def test_fewer_steps_than_there_are_do_not_undo_a_run(medium: str) -> None:
+    (run,) = train("td3_bc", medium, "runs", 400)
+    assert checkpoints.steps(run.folder) == [400, 300]
+    with pytest.raises(OffbenchError, match="is at step 400 already; give --steps 400"):
+        train("td3_bc", medium, "runs", 200)
+    with pytest.raises(OffbenchError, match="is at step 400 already"):
+        train("td3_bc", medium, "runs", 350)
+    train("td3_bc", medium, "runs", 300)  # finished at exactly 300 too: nothing to do
+    assert run.evaluations().keys() == {100, 200, 300, 400}
+    assert checkpoints.steps(run.folder) == [400, 300]
+
+
+def test_an_evaluation_off_the_grid_goes_when_a_run_is_extended(medium: str) -> None:
+    """A run extended from 150 to 300 scores like one that went straight there."""
+    (straight,) = train("td3_bc", medium, "straight", 300)
+    (run,) = train("td3_bc", medium, "runs", 150)
+    assert run.evaluations().keys() == {100, 150}
+    train("td3_bc", medium, "runs", 300)
+    assert run.evaluations() == straight.evaluations()
+    assert run.policy_path.read_bytes() == straight.policy_path.read_bytes()
+
+
+def test_two_datasets_in_a_stack_equal_each_alone(tiny: tuple[str, str], medium: str) -> None:
+    """Offsets, sizes and normalisers of each dataset: together as apart."""
+    other = offbench.collect(tiny[0], "random", behaviour_dir=tiny[1], workers=1, steps=437)
+    stack = train("bdb", [other, medium], "stack", 200, seeds=[0, 1])
+    for run in stack:
+        config = run.config()
+        (alone,) = train("bdb", config["dataset"], "alone", 200, seeds=config["seed"])
+        ours, theirs = (load_file(r.folder / "checkpoint-000000200.safetensors") for r in (run, alone))
+        for name in ours:
+            assert torch.equal(ours[name], theirs[name]), name
+
+
+def test_a_learned_beta_beside_a_fixed_one_resumes_right(medium: str) -> None:
+    whole = train("bdb", medium, "whole", 200, beta=["learned", 0.25], beta_learning_rate=1e-2)
+    for beta in ("learned", 0.25):  # apart first, then together
+        train("bdb", medium, "runs", 100, beta=beta, beta_learning_rate=1e-2)
+    together = train("bdb", medium, "runs", 200, beta=["learned", 0.25], beta_learning_rate=1e-2)
+    for a, b in zip(whole, together, strict=True):
+        ours, theirs = (load_file(run.folder / "checkpoint-000000200.safetensors") for run in (a, b))
+        for name in ours:
+            assert torch.equal(ours[name], theirs[name]), name
+
+
+def test_a_stack_killed_between_two_checkpoints_goes_on_from_the_older(medium: str) -> None:
+    whole = train("bdb", medium, "whole", 300, seeds=[0, 1])
+    first, second = train("bdb", medium, "runs", 200, seeds=[0, 1])
+    (second.folder / "checkpoint-000000200.safetensors").unlink()
+    for a, b in zip(whole, train("bdb", medium, "runs", 300, seeds=[0, 1]), strict=True):
+        assert a.policy_path.read_bytes() == b.policy_path.read_bytes()
+        assert a.evaluations_path.read_bytes() == b.evaluations_path.read_bytes()
+    assert first.config()["seed"] == 0
+
+
+@pytest.mark.parametrize("on_a_terminal", [False, True])
+def test_where_runs_go_on_is_said(
+    medium: str, on_a_terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train("td3_bc", medium, "runs", 100, seeds=[0, 1])
+    assert "going on" not in capsys.readouterr().err
+    train("td3_bc", medium, "runs", 200, seeds=[0])
+    capsys.readouterr()
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: on_a_terminal)
+    train("td3_bc", medium, "runs", 200, seeds=[0, 1, 2])
+    lines = capsys.readouterr().err.replace("\r", "\n").splitlines()
+    assert lines[0] == "already finished: 1 of 3 runs"
+    assert [line for line in lines if "going on" in line] == [f"td3_bc on {medium}: going on from step 100"]
+
+
+@pytest.mark.parametrize(("words", "goes_on"), [(["train", "bc"], True), (["show", "x-v0"], False)])
+def test_ctrl_c_promises_only_what_a_command_keeps(
+    words: list[str], goes_on: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(_: list[str]) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("offbench.cli.main._run", stop)
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    assert stopped.value.code == 130
+    said = capsys.readouterr().err
+    assert "offbench: stopped" in said
+    assert ("the same command goes on" in said) == goes_on
+
+
+def test_a_finished_run_is_left_alone(medium: str) -> None:
+    (run,) = train("td3_bc", medium, "runs", 100)
+    before = {path.name: path.stat().st_mtime_ns for path in run.folder.glob("*.safetensors")}
+    train("td3_bc", medium, "runs", 100)
+    assert {path.name: path.stat().st_mtime_ns for path in run.folder.glob("*.safetensors")} == before
+
+
+@pytest.mark.parametrize("damage", ["cut", "one bit"])
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(
+    damage: str, medium: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (whole,) = train("td3_bc", medium, "whole", 300)
+    (run,) = train("td3_bc", medium, "runs", 200)
+    newest = run.folder / "checkpoint-000000200.safetensors"
+    data = bytearray(newest.read_bytes())
+    data[-100] ^= 1
+    newest.write_bytes(data if damage == "one bit" else data[:1000])
+    train("td3_bc", medium, "runs", 300)
+    assert "checkpoint-000000200.safetensors is damaged" in (said := capsys.readouterr().err)
+    assert "using the one before it" in said
+    assert run.policy_path.read_bytes() == whole.policy_path.read_bytes()
+    assert run.evaluations_path.read_bytes() == whole.evaluations_path.read_bytes()
+
+
+def test_another_run_in_the_same_place_is_refused(tiny: tuple[str, str], medium: str) -> None:
+    train("td3_bc", medium, "runs", 100)
+    with pytest.raises(OffbenchError, match="eval_episodes 2, not 3"):
+        train("td3_bc", medium, "runs", 200, eval_episodes=3)
+    recipe, behaviour_dir = tiny
+    offbench.collect(recipe, "medium", behaviour_dir=behaviour_dir, workers=1, seed=1, overwrite=True)
+    with pytest.raises(OffbenchError, match="trained on another content of"):
+        train("td3_bc", medium, "runs", 200)
+
+
+def test_a_run_whose_files_were_deleted_is_not_taken_for_another(medium: str) -> None:
+    """Going on from half of its evaluations, or under a new config.json, would give numbers that are not the run's."""
+    (run,) = train("td3_bc", medium, "runs", 300)
+    for path, steps in itertools.product((run.config_path, run.evaluations_path), (300, 400)):
+        kept = path.read_bytes()
+        path.unlink()
+        with pytest.raises(OffbenchError, match=f"{path.name}.*put (it|the file) back, or delete the run"):
+            train("td3_bc", medium, "runs", steps)
+        path.write_bytes(kept)
+    run.write_evaluations({step: found for step, found in run.evaluations().items() if step != 200})
+    with pytest.raises(OffbenchError, match="lacks the evaluation of step 200"):
+        train("td3_bc", medium, "runs", 400)
+
+
+def test_a_deleted_policy_comes_back_from_the_checkpoint(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (run,) = train("td3_bc", medium, "runs", 300)
+    policy, evaluations = run.policy_path.read_bytes(), run.evaluations_path.read_bytes()
+    run.policy_path.unlink()
+    train("td3_bc", medium, "runs", 300)
+    assert (run.policy_path.read_bytes(), run.evaluations_path.read_bytes()) == (policy, evaluations)
+    run.losses_path.unlink()
+    capsys.readouterr()
+    train("td3_bc", medium, "runs", 400)
+    assert f"{run.losses_path} is gone: its rows begin again here" in capsys.readouterr().err
+    assert [row["step"] for row in run.losses()] == [400]
+
+
+def test_what_trained_a_run_later_is_noted_if_it_is_something_else(
+    medium: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (run,) = train("td3_bc", medium, "runs", 100)
+    train("td3_bc", medium, "runs", 200)
+    assert "sessions" not in run.config()
+    elsewhere = {"device": "cuda", "precision": "tf32", "versions": {"torch": "9"}, "hardware": {"cores": 99}}
+    monkeypatch.setattr("offbench.training.trainer.made_with", lambda *_: elsewhere)
+    for steps in (300, 400):
+        train("td3_bc", medium, "runs", steps)
+    config = run.config()
+    assert config["sessions"] == [{"step": 200, **elsewhere}]
+    assert (config["device"], config["steps"]) == ("cpu", 400)
+
+
+def test_divergence_is_said_and_the_last_checkpoint_kept(medium: str) -> None:
+    train("td3_bc", medium, "runs", 100)
+    (run,) = (Run(path.parent) for path in Path("runs").rglob("config.json"))
+    newest = run.folder / "checkpoint-000000100.safetensors"
+    tensors = load_file(newest)
+    tensors["critic.flat"] *= 1e30  # as a run that is about to overflow
+    save_file(tensors, newest, metadata={"offbench": '{"step": 100}'})
+    with pytest.raises(OffbenchError, match=r"became NaN or infinite by step 200.*last checkpoint is kept"):
+        train("td3_bc", medium, "runs", 300)
+    assert checkpoints.steps(run.folder) == [100]
+
+
+def test_two_processes_cannot_train_the_same_run(medium: str) -> None:
+
+    (run,) = train("td3_bc", medium, "runs", 100)
+    code = f"""
+import sys
+from offbench.cli.main import main
+main(["train", "td3_bc", "--dataset", {medium!r}, "--steps", "200", "--eval-every", "100", "--eval-episodes", "2",
+      "--hidden", "16,16", "--batch-size", "32"])
+"""
+    with run.locked():
+        found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=dict(os.environ))
+    assert found.returncode == 2
+    assert f"is being trained by process {os.getpid()} on {socket.gethostname()}" in found.stderr
+    assert run.config()["steps"] == 100  # who was refused has changed nothing

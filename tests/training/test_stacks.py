@@ -1,0 +1,163 @@
+"""Many runs of one command: over processes, to a deadline, with one that diverges."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import offbench
+from offbench.cli.main import main
+from offbench.common import checkpoints
+from offbench.common.errors import OffbenchError
+from offbench.training.grouping import cut, pending
+from offbench.training.jobs import Job, Order, perform
+from offbench.training.run import Run
+from offbench.training.trainer import Schedule
+from tests.data.test_transitions import episode, foreign
+
+SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32}
+TIMES: dict[str, Any] = {"eval_every": 100, "eval_episodes": 2}
+
+
+def orders(dataset: str, runs: str, seeds: int, algorithm: str = "bdb", **settings: Any) -> list[Order]:
+    known = {"hidden": [16, 16], "batch_size": 32} | settings
+    name = "-".join(f"{key}={value}" for key, value in settings.items())
+    return [Order(algorithm, dataset, known, seed, f"{runs}/{algorithm}{name}/{seed}") for seed in range(seeds)]
+
+
+def jobs_of(orders: list[Order], schedule: Schedule, processes: int, stack: int | str = "auto") -> list[Job]:
+    return [job for part in cut(orders, "cpu", processes, stack) for job in pending(part, schedule)]
+
+
+def finish(jobs: list[Job]) -> None:
+    for job in jobs:
+        assert perform(job, lambda step, note: None) == []
+
+
+@pytest.mark.slow
+def test_two_processes_train_what_one_does(medium: str) -> None:
+    """A stack of three against stacks of two and one: the same bits."""
+    one = offbench.train("bdb", medium, steps=200, runs="one", seeds=[0, 1, 2], workers=1, **SMALL, **TIMES)
+    two = offbench.train("bdb", medium, steps=200, runs="two", seeds=[0, 1, 2], workers=2, **SMALL, **TIMES)
+    for a, b in zip(map(Run, one), map(Run, two), strict=True):
+        assert a.policy_path.read_bytes() == b.policy_path.read_bytes()
+        assert a.evaluations_path.read_bytes() == b.evaluations_path.read_bytes()
+
+
+def test_a_deadline_within_a_training_changes_no_file(medium: str, home: Path) -> None:
+    schedule = Schedule(400, 400, 2, "cpu", 0)
+    finish(jobs_of(orders(medium, "whole", 2), schedule, 1))
+    over = replace(schedule, deadline=0.0)  # looked at every 100 updates
+    for step in (100, 200, 300, 400):
+        finish(jobs_of(orders(medium, "cut", 2), over, 1))
+        assert all(checkpoints.steps(Path(order.folder))[0] == step for order in orders(medium, "cut", 2))
+    for one, other in zip(orders(medium, "whole", 2), orders(medium, "cut", 2), strict=True):
+        for name in ("evaluations.csv", "losses.csv", "policy.safetensors", "checkpoint-000000400.safetensors"):
+            assert (Path(one.folder) / name).read_bytes() == (Path(other.folder) / name).read_bytes(), name
+
+
+def test_stacks_are_cut_for_the_processes_and_by_size(medium: str) -> None:
+    schedule = Schedule(100, 100, 2, "cpu", 0)
+
+    def sizes(count: int, processes: int, stack: int | str = "auto") -> list[int]:
+        jobs = jobs_of(orders(medium, "runs", count), schedule, processes, stack=stack)
+        return [len(job.orders) for job in jobs]
+
+    assert sizes(5, 1) == [5]
+    assert sizes(5, 2) == [3, 2]
+    assert sizes(1, 8) == [1]
+    assert sizes(20, 1) == [7, 7, 6]  # at most 8 of them in one process
+    assert sizes(20, 2) == [5, 5, 5, 5]  # three stacks would leave a process idle at the end
+    assert sizes(4, 1, stack=3) == [2, 2]
+    with pytest.raises(OffbenchError, match="stack must be auto or a whole number"):
+        sizes(4, 1, stack=0)
+
+
+def test_what_cannot_differ_within_a_stack_makes_stacks_of_its_own(medium: str) -> None:
+    schedule = Schedule(100, 100, 2, "cpu", 0)
+    mixed = orders(medium, "runs", 2, beta=0.5) + orders(medium, "runs", 1, beta="adaptive")
+    mixed += orders(medium, "runs", 2, critics=3) + orders(medium, "runs", 1, algorithm="td3_bc")
+    assert [len(job.orders) for job in jobs_of(mixed, schedule, 1)] == [3, 2, 1]
+
+
+def test_another_environment_makes_a_stack_of_its_own(medium: str, home: Path) -> None:
+    """The same shapes, another time limit: evaluations and references must not be mixed up."""
+    shutil.copytree(home / "minari" / medium, home / "minari" / "longer-v0")
+    path = home / "minari" / "longer-v0" / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    spec = json.loads(metadata["eval_env_spec"]) | {"max_episode_steps": 500}
+    path.write_text(json.dumps(metadata | {"eval_env_spec": json.dumps(spec), "dataset_id": "longer-v0"}))
+    both = orders(medium, "runs", 2) + orders("longer-v0", "longer", 1)
+    jobs = jobs_of(both, Schedule(100, 100, 2, "cpu", 0), 1)
+    assert [{order.dataset for order in job.orders} for job in jobs] == [{medium}, {"longer-v0"}]
+
+
+def test_a_stack_that_goes_on_has_the_same_runs_as_before(medium: str) -> None:
+    """Of two stacks of two, one is done: the other is not cut anew to fill the processes."""
+    schedule = Schedule(200, 100, 2, "cpu", 0)
+    finish(jobs_of(orders(medium, "runs", 4), schedule, 2)[:1])
+    (job,) = jobs_of(orders(medium, "runs", 4), schedule, 2)
+    assert [order.seed for order in job.orders] == [2, 3]
+
+
+def test_a_run_that_diverges_is_marked_and_the_others_go_on(medium: str) -> None:
+    common: dict[str, Any] = {"runs": "runs", "seeds": [0, 1], "workers": 1, **SMALL, **TIMES}
+    calm = offbench.train("td3_bc", medium, steps=300, **common | {"runs": "calm"})
+    bad, good = offbench.train("td3_bc", medium, steps=100, **common)
+    newest = bad / "checkpoint-000000100.safetensors"
+    tensors = load_file(newest)
+    tensors["critic.flat"] *= 1e30  # as a run that is about to overflow
+    save_file(tensors, newest, metadata={"offbench": '{"step": 100}'})
+    with pytest.raises(OffbenchError, match=r"seed-0: critic.*became NaN or infinite by step 200"):
+        offbench.train("td3_bc", medium, steps=300, **common)
+    assert checkpoints.steps(bad) == [100]
+    assert Run(bad).evaluations().keys() == {100}
+    ours, theirs = (load_file(run / "checkpoint-000000300.safetensors") for run in (calm[1], good))
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    with pytest.raises(OffbenchError, match="seed-0 has diverged before and is left as it is"):
+        offbench.train("td3_bc", medium, steps=300, **common)
+
+
+def test_several_networks_in_one_command(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--steps", "2", "--eval-every", "2", "--eval-episodes", "1", "--workers", "1"]
+    main(["train", "bc", "--dataset", medium, *words, "--hidden", "8,8", "16x16", "--runs", "my runs"])
+    *folders, hint = capsys.readouterr().out.splitlines()
+    assert [Run(Path(folder)).config()["settings"]["hidden"] for folder in folders] == [[8, 8], [16, 16]]
+    main(shlex.split(hint.removeprefix("next: offbench ")))  # as it can be pasted
+    assert "hidden=16x16" in capsys.readouterr().out
+
+
+def test_any_number_of_settings_has_a_folder(medium: str) -> None:
+    settings = {"alpha": 3.0, "discount": 0.98, "tau": 0.01, "policy_noise": 0.3, "noise_clip": 0.4, "policy_freq": 3}
+    settings |= {"actor_learning_rate": 0.001, "critic_learning_rate": 0.001, "normalize": False, "beta": "adaptive"}
+    settings |= {"beta_scope": "batch", "critics": 3, "uncertainty": "relative", "uncertainty_scale": 2.0}
+    settings |= {"beta_max": 0.5, "cloning_steps": 1, "critic_penalty": "cql", "penalty_weight": [2.0, 3.0]}
+    more: dict[str, Any] = {"steps": 2, "eval_every": 2, "eval_episodes": 1, "workers": 1, **SMALL, **settings}
+    folders = offbench.train("bdb", medium, **more)
+    assert len(set(folders)) == 2
+    assert all(len(part.encode()) <= 255 for folder in folders for part in folder.parts)
+    variants = [Run(folder).config()["variant"] for folder in folders]
+    assert ["penalty_weight=2," in variants[0], "penalty_weight=3," in variants[1]] == [True, True]
+    assert offbench.train("bdb", medium, **more) == folders  # finished already
+    found = offbench.compare(*[f"bdb/{folder.parent.name}" for folder in folders])
+    assert found.a.endswith(variants[0])
+    assert found.b.endswith(variants[1])
+
+
+def test_data_without_an_environment_are_trained_on_and_that_is_said(
+    home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    foreign("house-v0", [episode(40, 0, True), episode(40, 1, True)])
+    main(["train", "bc", "--dataset", "house-v0", "--steps", "2", "--eval-every", "2", "--hidden", "8,8"])
+    out, err = capsys.readouterr()
+    assert "house-v0 names no environment" in err
+    assert "normalize" not in out
+    assert "offbench evaluate runs/house-v0/bc/hidden=8x8/seed-0 --env" in out

@@ -1,0 +1,122 @@
+"""`verify` plays episodes again: bit for bit on the same physics, within a tolerance on others, or step by step."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium as gym
+import h5py
+import numpy as np
+import pytest
+
+from offbench.common.provenance import versions
+from offbench.data import minari_store
+from offbench.envs.environments import env_spec, make_env
+from offbench.rollouts.rollouts import Episode
+from offbench.verification.verify import verify
+from tests.verification.test_verify import change_metadata, codes, each, hopper, tamper
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+__all__ = ["hopper"]  # a fixture
+
+
+def recorded(name: str, env_id: str, change: Callable[[Any], None], seeded: bool = True, steps: int = 300) -> str:
+    """Record random actions in an environment that `change` has had its hands on, as if it were the real one."""
+    spec = env_spec(env_id)
+    env, rng = make_env(spec), np.random.default_rng(0)
+    change(env.unwrapped)
+    low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
+
+    def episodes() -> Iterator[Episode]:
+        for seed in range(4):
+            observations, actions, rewards, ends = [env.reset(seed=seed)[0].copy()], [], [], (False, False)
+            while not any(ends) and len(actions) < steps:
+                actions.append(rng.uniform(low, high).astype(np.float32))
+                observation, reward, *flags, _ = env.step(actions[-1])
+                observations.append(observation.copy())
+                rewards.append(float(reward))
+                ends = (bool(flags[0]), bool(flags[1]))
+            ends = ends if any(ends) else (False, True)
+            yield Episode(seed if seeded else -1, np.array(observations), np.array(actions), np.array(rewards), *ends)
+
+    metadata = {"dataset_id": name, "minari_version": versions()["minari"], "offbench": {"versions": versions()}}
+    with minari_store.claimed(name, False) as path:
+        minari_store.write(path, episodes(), spec, metadata, 1000)
+    return name
+
+
+def nothing(_: Any) -> None:
+    pass
+
+
+def heavier(env: Any) -> None:
+    env.model.opt.gravity[2] *= 1.02
+
+
+def slower(env: Any) -> None:
+    env.model.opt.timestep *= 1.01
+
+
+@pytest.mark.parametrize("seeded", [True, False])
+@pytest.mark.parametrize("change", [heavier, slower])
+def test_other_physics(change: Callable[[Any], None], seeded: bool) -> None:
+    assert codes(recorded("other-v0", "Hopper-v5", change, seeded)) == {"other-physics"}
+
+
+@pytest.mark.parametrize("env_id", ["Hopper-v5", "Walker2d-v5", "HalfCheetah-v5", "Ant-v5", "InvertedPendulum-v5"])
+def test_one_step_replay_serves_the_mujoco_environments(env_id: str) -> None:
+    report = verify(recorded("same-v0", env_id, nothing, seeded=False), workers=1)
+    assert report.ok, report.lines()
+    assert any("4 episodes played again one step at a time" in line for line in report.checked)
+    assert codes(recorded("heavier-v0", env_id, heavier, seeded=False)) == {"other-physics"}
+
+
+def test_an_environment_whose_state_cannot_be_told_is_left_out_and_said() -> None:
+    report = verify(recorded("reacher-v0", "Reacher-v5", nothing, seeded=False), workers=1)
+    assert report.ok
+    assert any("playing 4 episodes again: no seed, and no state" in line for line in report.skipped)
+    assert codes(recorded("seeded-v0", "Reacher-v5", slower)) == {"other-physics"}
+
+
+def test_another_version_is_compared_within_a_tolerance_and_said(hopper: str) -> None:
+    change_metadata(hopper, versions=versions() | {"mujoco": "3.2.3"})
+    report = verify(hopper, workers=1)
+    assert report.ok
+    assert "recorded with mujoco 3.2.3, installed is" in report.warnings[0]
+
+    def edit(file: h5py.File) -> None:
+        for group in each(file):
+            group["observations"][:] = group["observations"][()] * 1.001
+
+    assert codes(tamper(hopper, edit)) == {"other-physics"}
+
+
+def test_a_foreign_recording_with_seeds_is_played_again() -> None:
+    """Written by Minari's own function, with no provenance of ours."""
+    env = gym.make("InvertedPendulum-v5")
+    env.action_space.seed(0)
+    buffers = []
+    for seed in range(5):
+        buffer: dict[str, Any] = {"observations": [env.reset(seed=seed)[0].copy()]}
+        buffer |= {key: [] for key in ("actions", "rewards", "terminations", "truncations")}
+        while not any(buffer["terminations"] + buffer["truncations"]):
+            action = env.action_space.sample()
+            observation, *rest, _ = env.step(action)
+            for key, value in zip(buffer, (observation.copy(), action, *rest), strict=True):
+                buffer[key].append(value)
+        arrays = {key: np.array(value) for key, value in buffer.items()}
+        buffers.append(EpisodeBuffer(seed=seed, infos={}, **arrays))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        minari.create_dataset_from_buffers(
+            "theirs-v0", buffers, env=env, data_format="hdf5", requirements=[f"mujoco=={versions()['mujoco']}"]
+        )
+    report = verify("theirs-v0", workers=1)
+    assert report.ok, report.lines()
+    assert any("5 episodes played again from their seeds, bit for bit" in line for line in report.checked)
