@@ -1,6 +1,6 @@
 #!/bin/sh
-# The demo: from a shipped behaviour agent to a score table, in a folder of its own (./demo).
-# Short trainings: the scores show that everything works, not how good an algorithm is.
+# The demo: from a shipped behaviour agent to a score table, in the folder ./demo.
+# The trainings are short: the scores show that everything works, not how good the algorithms are.
 set -eu
 BIN=${BIN:-.venv/bin}
 export MINARI_DATASETS_PATH="$PWD/demo/minari" OFFBENCH_CACHE="$PWD/demo/cache"
@@ -18,4 +18,4 @@ train="--dataset hopper-medium-v0 --runs demo/runs --eval-episodes 5"
 
 echo "== scores"
 "$BIN/offbench" normalize --runs demo/runs --plot demo/curves.png
-echo "the same as a page: $BIN/offbench report --runs demo/runs"
+echo "to see them as a page: $BIN/offbench report --runs demo/runs"
