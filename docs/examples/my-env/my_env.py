@@ -1,4 +1,4 @@
-"""PointMass-v0: push a point over a table to the middle and keep it there; it may not fall off."""
+"""PointMass-v0: push a point to the center of a table and keep it there, without letting it fall off."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import gymnasium as gym
 import numpy as np
 
 STEP = 0.05  # seconds
-EDGE = 1.0  # the table's half width
+EDGE = 1.0  # half the width of the table
 
 
 class PointMass(gym.Env[np.ndarray, np.ndarray]):
     """Observation: position and velocity [4]; action: force [2] in [-1, 1].
 
-    Reward 1 - distance from the middle; the episode terminates when the point falls off the table.
+    The reward is 1 - distance from the center. The episode terminates when the point falls off the table.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (Gymnasium's way)
@@ -26,14 +26,14 @@ class PointMass(gym.Env[np.ndarray, np.ndarray]):
         self.position, self.velocity = np.zeros(2), np.zeros(2)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        """Put the point somewhere near the edge, at rest. All chance comes from `self.np_random`."""
+        """Place the point near the edge, at rest. All random numbers come from `self.np_random`."""
         super().reset(seed=seed)
         angle = self.np_random.uniform(0, 2 * np.pi)
         self.position, self.velocity = 0.8 * EDGE * np.array([np.cos(angle), np.sin(angle)]), np.zeros(2)
         return self._observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Push for one step."""
+        """Apply a force for one step."""
         self.velocity = self.velocity + STEP * (4 * np.asarray(action, np.float64) - self.friction * self.velocity)
         self.position = self.position + STEP * self.velocity
         terminated = bool(np.abs(self.position).max() > EDGE)
