@@ -1,4 +1,4 @@
-"""What makes these pages, which are also read on a code server, a site (see mkdocs.yml).
+"""Hooks that turn these pages, which are also read on a code server, into a site (see mkdocs.yml).
 
 - Dataset cards (datasets/<env>/README.md) become pages below cards/.
 - Links to source files outside docs/ become plain text.
@@ -28,18 +28,18 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Mend links."""
+    """Rewrite links that lead out of docs/."""
 
-    def mend(match: re.Match[str]) -> str:
-        text, target, place = match[1], match[2], match[3] or ""
+    def rewrite(match: re.Match[str]) -> str:
+        text, target, anchor = match[1], match[2], match[3] or ""
         if re.match(r"\w+:", target):
             return match[0]
         card = re.fullmatch(r"\.\./datasets/([\w-]+)/README\.md", target)
         target = f"cards/{card[1]}/index.md" if card else target
-        known = files.get_file_from_path(target)
+        page_of_site = files.get_file_from_path(target)
         outside = target.startswith("../") or page.file.src_uri.startswith("cards/")
-        if known is None and outside:
+        if page_of_site is None and outside:
             return text
-        return f"[{text}]({target}{place})"
+        return f"[{text}]({target}{anchor})"
 
-    return LINK.sub(mend, markdown)
+    return LINK.sub(rewrite, markdown)

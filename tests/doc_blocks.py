@@ -172,6 +172,6 @@ def environment_beside(folder: Path) -> Path:
     ours = [path for path in sys.path if path.endswith("site-packages")]
     (site / "ours.pth").write_text("".join(f"import site; site.addsitedir({path!r})\n" for path in ours))
     script = folder / "bin" / "offbench"
-    script.write_text(f"#!{python}\nfrom offbench.cli import main\n\nmain()\n")
+    script.write_text(f"#!{python}\nfrom offbench.cli.main import main\n\nmain()\n")
     script.chmod(0o755)
     return python

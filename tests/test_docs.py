@@ -116,6 +116,15 @@ def test_links_lead_somewhere() -> None:
     assert count > 20
 
 
+def test_source_files_named_in_the_pages_exist() -> None:
+    named = re.compile(r"(?<![\w/.-])((?:offbench|algos|tests|docs|datasets)/[\w/-]+\.(?:py|toml|md|sh|csv))\b")
+    files = {
+        (page.name, file) for page in (*pages(), ROOT / "CONTRIBUTING.md") for file in named.findall(page.read_text())
+    }
+    assert len(files) > 40
+    assert not {(page, file) for page, file in files if not (ROOT / file).exists()}
+
+
 def test_every_page_is_in_the_sites_contents() -> None:
     listed = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text()))
     assert {page.name for page in DOCS.glob("*.md")} <= listed
