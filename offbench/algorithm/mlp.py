@@ -12,6 +12,8 @@ the inputs of each layer have a last column of ones:
 
     [h | 1] [batch, in + 1]  @  [W; b] [in + 1, out]          one product gives h W + b,
     [h | 1].T @ gradient                                      and one the gradients of W and b
+
+In bfloat16 the wide products (`_Half`) read copies of their factors in bfloat16; everything else stays in float32.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -31,7 +33,9 @@ from offbench.algorithm.capture import one_call
 
 _WAY = ContextVar("way", default="numpy")
 Array = np.ndarray[Any, np.dtype[np.float32]]
+Buffer = TypeVar("Buffer", Array, Tensor)
 ALIGNED = 16  # float32 numbers of 64 bytes: rows of buffers begin where a processor's wide registers do
+NARROW = 64  # a product with fewer inputs or outputs gains nothing from bfloat16 on a CPU
 
 
 def perceptrons(flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str) -> Tensor:
@@ -43,11 +47,10 @@ def perceptrons(flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], ac
         activation: of the hidden layers, relu or tanh.
     """
     way = _WAY.get()
-    if way == "bfloat16":
-        return _in_bfloat16(flat, inputs, sizes, activation)
+    half = way == "bfloat16"
     if flat.device.type != "cpu" or flat.dtype != torch.float32 or way == "pytorch":
-        return stacked(flat, inputs, sizes, activation)
-    outputs: Tensor = _Perceptrons.apply(flat, tuple(sizes), activation, *inputs)  # type: ignore[no-untyped-call]
+        return stacked(flat, inputs, sizes, activation, torch.bfloat16 if half else None)
+    outputs: Tensor = _Perceptrons.apply(flat, tuple(sizes), activation, half, *inputs)  # type: ignore[no-untyped-call]
     return outputs
 
 
@@ -63,18 +66,6 @@ def products_by(way: str) -> Iterator[None]:
         yield
     finally:
         _WAY.reset(token)
-
-
-def _in_bfloat16(flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str) -> Tensor:
-    """Return what `perceptrons` does, with products in bfloat16; on a CPU one perceptron goes after the other."""
-    if flat.device.type != "cpu":
-        return stacked(flat, inputs, sizes, activation, torch.bfloat16)
-    copies, runs = flat.shape[:2]
-    outputs = [
-        stacked(flat[copy, run][None, None], [x[run : run + 1] for x in inputs], sizes, activation, torch.bfloat16)
-        for copy, run in itertools.product(range(copies), range(runs))
-    ]
-    return torch.cat(outputs).view(copies, runs, *outputs[0].shape[2:])
 
 
 def stacked(
@@ -113,20 +104,22 @@ def _layers(flat: Tensor, sizes: Sequence[int]) -> list[Tensor]:
 
 class _Perceptrons(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, flat: Tensor, sizes: tuple[int, ...], activation: str, *inputs: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, flat: Tensor, sizes: tuple[int, ...], activation: str, half: bool, *inputs: Tensor
+    ) -> Tensor:
         keep = any(ctx.needs_input_grad)
         with one_call() as recording:
-            ctx.made = made = Pass(flat, inputs, sizes, activation, keep)
+            ctx.made = made = Pass(flat, inputs, sizes, activation, keep, half)
             made.run()
         if recording:
-            recording.add(("forward", sizes, activation, keep), (flat, inputs), made.outputs, (made.run, (), {}))
+            recording.add(("forward", sizes, activation, keep, half), (flat, inputs), made.outputs, (made.run, (), {}))
         ctx.save_for_backward(flat)  # autograd sees if it was changed since
         return made.outputs
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         (flat,) = ctx.saved_tensors
-        needs = ctx.needs_input_grad[0], ctx.needs_input_grad[3:]
+        needs = ctx.needs_input_grad[0], ctx.needs_input_grad[4:]
         with one_call() as recording:
             back = PassBack(ctx.made, flat, grads[0], *needs)
             back.run()
@@ -134,7 +127,7 @@ class _Perceptrons(torch.autograd.Function):
         if recording:
             reads, writes = (ctx.made.outputs, grads[0]), [one for one in found if one is not None]
             recording.add(("backward", needs), reads, writes, (back.run, (), {}))
-        return found[0], None, None, *found[1:]
+        return found[0], None, None, None, *found[1:]
 
 
 class Pass:
@@ -142,10 +135,17 @@ class Pass:
 
     Args:
         keep: whether a backward pass may follow, so that the layers' activations must not be overwritten.
+        half: whether wide products are in bfloat16.
     """
 
     def __init__(
-        self, flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str, keep: bool
+        self,
+        flat: Tensor,
+        inputs: Sequence[Tensor],
+        sizes: Sequence[int],
+        activation: str,
+        keep: bool,
+        half: bool = False,
     ) -> None:
         self.sizes, self.activation = sizes, activation
         self.shape = (flat.shape[0], *inputs[0].shape[:2])  # copies, runs, batch
@@ -162,7 +162,8 @@ class Pass:
         self.layers = [_array(layer) for layer in _layers(flat, sizes)]  # each [copies, runs, in + 1, out]
         # what goes into each layer, [batch, in + 1], of each perceptron
         self.into: dict[tuple[int, int], list[Array]] = {}
-        self._steps: list[tuple[Array, Array, Array, Callable[[], Any] | None]] = []
+        self.halves: dict[tuple[int, int, int], _Half] = {}  # the layers in bfloat16, of each perceptron
+        self._steps: list[tuple[Callable[..., Any], tuple[Any, ...], Callable[[], Any] | None]] = []
         outputs = _array(self.outputs)
         for copy, run in itertools.product(range(copies), range(runs)):
             h, self.into[copy, run] = x[run], [x[run]]
@@ -171,17 +172,22 @@ class Pass:
                 into = make(batch, width)
                 hidden = torch.from_numpy(into[:, :-1])
                 activate = hidden.relu_ if activation == "relu" else hidden.tanh_
-                self._steps.append((h, self.layers[layer][copy, run], into[:, :-1], activate))
+                weight = self.layers[layer][copy, run]
+                if half and min(sizes[layer], width) >= NARROW:
+                    product = self.halves[copy, run, layer] = _Half(h, weight, into[:, :-1], keep)
+                    self._steps.append((product.forward, (), activate))
+                else:
+                    self._steps.append((np.matmul, (h, weight, into[:, :-1]), activate))
                 h = into
                 self.into[copy, run].append(into)
-            self._steps.append((h, self.layers[-1][copy, run], outputs[copy, run], None))
+            self._steps.append((np.matmul, (h, self.layers[-1][copy, run], outputs[copy, run]), None))
 
     def run(self) -> None:
         """Compute `outputs`."""
         for into, source in self._loads:
             np.copyto(into, source)
-        for h, layer, out, activate in self._steps:
-            np.matmul(h, layer, out=out)
+        for multiply, arguments, activate in self._steps:
+            multiply(*arguments)
             if activate is not None:
                 activate()
 
@@ -213,11 +219,21 @@ class PassBack:
             g = last[copy, run]
             for layer in reversed(range(len(sizes) - 1)):
                 h, weight = forward.into[copy, run][layer], forward.layers[layer][copy, run][:-1]
+                half = forward.halves.get((copy, run, layer))
+                if half is not None:
+                    self._calls.append((half.load, (torch.from_numpy(g),)))
                 if of_layers is not None:
-                    self._calls.append((np.matmul, (h.T, g, of_layers[layer][copy, run])))
+                    of_layer = of_layers[layer][copy, run]
+                    if half is None:
+                        self._calls.append((np.matmul, (h.T, g, of_layer)))
+                    else:
+                        self._calls.append((half.of_weight, (torch.from_numpy(of_layer),)))
                 if layer:
                     before = _shared(f"gradient {layer % 2}", _rows)(batch, sizes[layer])
-                    self._product(g, weight.T, before)
+                    if half is None:
+                        self._product(g, weight.T, before)
+                    else:
+                        self._calls.append((half.of_h, (torch.from_numpy(before),)))
                     self._calls.append(_through(forward.activation, before, h[:, :-1]))
                     g = before
                     continue
@@ -245,6 +261,53 @@ class PassBack:
         """Compute `of_flat` and `of_inputs`."""
         for function, arguments in self._calls:
             function(*arguments)
+
+
+class _Half:
+    """The product h @ [W; b] of one layer in bfloat16, and its gradients: factors and results are rounded.
+
+    Args:
+        h: [batch, in + 1], its last column ones.
+        weight: [in + 1, out].
+        out: [batch, out].
+        keep: whether a backward pass may follow.
+    """
+
+    def __init__(self, h: Array, weight: Array, out: Array, keep: bool) -> None:
+        self._h, self._weight, self._out = map(torch.from_numpy, (h, weight, out))
+        batch, (rows, columns) = len(h), weight.shape
+        factor = _halves if keep else _shared("factor", _halves)
+        self._half_h, self._half_weight = factor(batch, rows), factor(rows, columns)
+        self._half_out = _shared("product", _halves)(batch, columns)
+        if keep:
+            self._half_gradient = _shared("gradient", _halves)(batch, columns)
+            self._half_of_weight = _shared("product", _halves)(rows, columns)
+            self._half_of_h = _shared("product", _halves)(batch, rows - 1)
+
+    def forward(self) -> None:
+        """Compute `out`."""
+        self._half_h.copy_(self._h)
+        self._half_weight.copy_(self._weight)
+        torch.mm(self._half_h, self._half_weight, out=self._half_out)
+        self._out.copy_(self._half_out)
+
+    def load(self, gradient: Tensor) -> None:
+        """Take the gradient of `out`, [batch, out], of which the other gradients follow."""
+        self._half_gradient.copy_(gradient)
+
+    def of_weight(self, found: Tensor) -> None:
+        """Compute the gradient of `weight`."""
+        torch.mm(self._half_h.T, self._half_gradient, out=self._half_of_weight)
+        found.copy_(self._half_of_weight)
+
+    def of_h(self, found: Tensor) -> None:
+        """Compute the gradient of `h` without its ones, [batch, in]."""
+        torch.mm(self._half_gradient, self._half_weight[:-1].T, out=self._half_of_h)
+        found.copy_(self._half_of_h)
+
+
+def _halves(rows: int, columns: int) -> Tensor:
+    return torch.empty(rows, columns, dtype=torch.bfloat16)
 
 
 def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
@@ -286,12 +349,12 @@ def _with_ones(batch: int, width: int) -> Array:
 _SCRATCH = threading.local()
 
 
-def _shared(use: str, make: Callable[[int, int], Array]) -> Callable[[int, int], Array]:
+def _shared(use: str, make: Callable[[int, int], Buffer]) -> Callable[[int, int], Buffer]:
     """Return `make` whose arrays all passes of this thread share, for what is used up within one pass."""
 
-    def shared(batch: int, width: int) -> Array:
-        arrays: dict[Any, Array] = _SCRATCH.__dict__.setdefault("arrays", {})
-        key = (use, batch, width)
+    def shared(batch: int, width: int) -> Buffer:
+        arrays: dict[Any, Buffer] = _SCRATCH.__dict__.setdefault("arrays", {})
+        key = (use, make, batch, width)
         if key not in arrays:
             arrays[key] = make(batch, width)
         return arrays[key]

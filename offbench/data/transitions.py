@@ -121,7 +121,7 @@ def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     action_space = box(data.action_space, f"{dataset_id}: actions")
     if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
         raise OffbenchError(f"{dataset_id}: the action space must be bounded to be scaled, not {action_space}")
-    folder = cache() / _key(dataset_id, metadata)
+    folder = cache() / _key(dataset_id, metadata, stamps)
     sources = {f"data/{name}": minari_store.path_of(dataset_id) / "data" / name for name in stamps}
     found = _mapped(folder, sources)
     if found is None:
@@ -172,13 +172,12 @@ def cache() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "offbench"
 
 
-def _key(dataset_id: str, metadata: dict[str, Any]) -> str:
+def _key(dataset_id: str, metadata: dict[str, Any], stamps: Stamps) -> str:
     """Return the cache's name for a dataset: it changes with the content and with the files."""
     folder = minari_store.path_of(dataset_id) / "data"
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    seen = [(str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+    sizes_and_times = [(name, size, mtime) for name, (size, mtime, *_) in stamps.items()]
     content = minari_store.provenance(metadata).get("content_sha256")
-    text = json.dumps([4, dataset_id, content, str(folder), seen])
+    text = json.dumps([4, dataset_id, content, str(folder), sizes_and_times])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 

@@ -67,6 +67,31 @@ def test_outputs_and_gradients_are_autograds(
         torch.testing.assert_close(one.double(), other, rtol=2e-5, atol=2e-5 * other.abs().max().item())
 
 
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_bfloat16_is_near_float32_with_wide_layers(activation: str) -> None:
+    sizes, batch = SHAPES[1]
+    flat, inputs, grad = made(sizes, batch, 2, 2)
+    exact = single([flat, *inputs])
+    wanted = perceptrons(exact[0], exact[1:], sizes, activation)
+    wanted_grads = torch.autograd.grad(wanted, exact, grad.float())
+    ours = single([flat, *inputs])
+    with products_by("bfloat16"):
+        outputs = perceptrons(ours[0], ours[1:], sizes, activation)
+        grads = torch.autograd.grad(outputs, ours, grad.float())
+    for one, other in zip((outputs, *grads), (wanted, *wanted_grads), strict=True):
+        distance = ((one - other).norm() / other.norm()).item()
+        assert 1e-4 < distance < 0.1  # rounded to 8 bits, more than once
+
+
+def test_bfloat16_leaves_narrow_layers_in_float32() -> None:
+    sizes, batch = SHAPES[0]
+    flat, inputs, _ = made(sizes, batch, 2, 2)
+    one = perceptrons(flat.float(), [x.float() for x in inputs], sizes, "relu")
+    with products_by("bfloat16"):
+        other = perceptrons(flat.float(), [x.float() for x in inputs], sizes, "relu")
+    assert torch.equal(one, other)
+
+
 @pytest.mark.parametrize("asked", [0, 1, 2])
 def test_a_gradient_that_nobody_asks_for_changes_nothing(asked: int) -> None:
     sizes, batch = SHAPES[1]
