@@ -18,8 +18,9 @@ import torch
 from offbench.agents.ladder import read_ladder
 from offbench.algorithm import mlp
 from offbench.algorithm.capture import Recording
+from offbench.algorithm.mlp import products_by
 from offbench.common.files import write_bytes
-from offbench.common.provenance import hardware
+from offbench.common.provenance import hardware, has_bfloat16
 from offbench.common.tables import markdown
 from offbench.envs.environments import make_env
 from offbench.envs.recipes import load_recipe
@@ -29,6 +30,7 @@ from tests.speed.sides import ENV, stack_of
 
 ROUNDS = 5  # the least of so many is taken: whatever disturbs adds to it
 PRODUCTS, ACTIVATIONS = "matrix products, biases included", "activations and the products with one output's gradient"
+HALVES = "matrix products in bfloat16, with the rounding of their factors and results"
 OPTIMISER, REST = "Adam and Polyak averaging", "all else: losses, sampling, copies, overhead of small operations"
 
 
@@ -74,11 +76,12 @@ def recording() -> dict[str, float]:
     }
 
 
-def update(algorithm: str) -> dict[str, float]:
+def update(algorithm: str, precision: str) -> dict[str, float]:
     """Return milliseconds of an update (2-layer networks), by what a replay calls."""
-    stack = stack_of(algorithm)
-    for _ in stack.train(10):  # records each kind of update
-        pass
+    with products_by("bfloat16" if precision == "bfloat16" else "numpy"):
+        stack = stack_of(algorithm)
+        for _ in stack.train(10):  # records each kind of update
+            pass
     kinds = [list(calls(recording)) for recording in stack.program._recordings.values()]
     spent: dict[str, float] = {}
     with torch.inference_mode():
@@ -99,13 +102,15 @@ def calls(recording: Recording) -> Iterator[tuple[str, Callable[[], object]]]:
         if isinstance(owner, mlp.Pass):
             for into, source in owner._loads:
                 yield REST, partial(np.copyto, into, source)
-            for h, layer, out, activate in owner._steps:
-                yield PRODUCTS, partial(np.matmul, h, layer, out=out)
+            for multiply, factors, activate in owner._steps:
+                yield PRODUCTS if multiply is np.matmul else HALVES, partial(multiply, *factors)
                 if activate is not None:
                     yield ACTIVATIONS, activate
         elif isinstance(owner, mlp.PassBack):
             for inner, inputs in owner._calls:
-                yield PRODUCTS if inner is np.matmul else ACTIVATIONS, partial(inner, *inputs)
+                half = isinstance(getattr(inner, "__self__", None), mlp._Half)
+                part = PRODUCTS if inner is np.matmul else HALVES if half else ACTIVATIONS
+                yield part, partial(inner, *inputs)
         else:
             name = getattr(function, "__name__", str(function))
             yield (
@@ -123,8 +128,9 @@ def rows(what: str, unit: str, parts: dict[str, float]) -> list[list[str]]:
 def main() -> None:
     """Measure, print and write."""
     found = rows("a recorded step of hopper, medium", "µs", recording())
-    for algorithm in ("td3_bc", "bdb", "cql"):
-        found += rows(f"an update of {algorithm}", "ms", update(algorithm))
+    for precision in ("float32", "bfloat16") if has_bfloat16() else ("float32",):
+        for algorithm in ("td3_bc", "bdb", "cql"):
+            found += rows(f"an update of {algorithm}, {precision}", "ms", update(algorithm, precision))
     text = "\n".join(markdown(["of", "part", "takes", "share"], found)) + "\n"
     print(text)
     write_bytes(DOCS / "results" / f"profile-{hardware()['hardware']['vectors'].lower()}.md", text.encode())

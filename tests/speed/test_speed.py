@@ -37,7 +37,7 @@ def test_a_profile_adds_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(profile, "ROUNDS", 1)
     assert all(0 < value < 10_000 for value in profile.recording().values())
     for algorithm in ("td3_bc", "bdb", "cql"):
-        parts = profile.update(algorithm)
+        parts = profile.update(algorithm, "float32")
         assert parts.keys() == {profile.PRODUCTS, profile.ACTIVATIONS, profile.OPTIMISER, profile.REST}
         assert all(0 < value < 10_000 for value in parts.values()), parts
     assert [row[-1] for row in profile.rows("x", "ms", {"one": 3.0, "other": 1.0})] == ["75%", "25%"]
