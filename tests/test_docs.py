@@ -164,4 +164,4 @@ def test_the_site_builds_strictly(tmp_path: Path) -> None:
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "Hopper-v5 at three levels" in (tmp_path / "site" / "index.html").read_text()
-    assert 'id="offbench.data.collect.collect"' in (tmp_path / "site" / "api.html").read_text()
+    assert 'id="offbench.collect"' in (tmp_path / "site" / "api.html").read_text()
