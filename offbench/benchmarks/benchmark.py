@@ -66,7 +66,7 @@ def benchmark(
     """Run a grid to its end, or as far as the budget allows; finished parts are left alone.
 
     Args:
-        grid: a shipped grid's name (paper, paper-small, smoke), a file (`./mine.toml`), or what
+        grid: a shipped grid's name such as `medium`, a file (`./mine.toml`), or what
             `offbench.benchmarks.plan.prepare` returns, which takes the folder, the device and the processes.
         budget: "9m", "2h" or "90s": stops cleanly after that time; the same call goes on.
         shard: (i, n): the i-th of n shares of the runs, for machines with a shared file system.
