@@ -20,18 +20,28 @@ mode unless `eval_samples` says otherwise (Table 5: the best of 10, as the grid 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from offbench.algorithm import Batch, Draw, Learned, Network, PolicyParts, Target, setting
+from offbench.algorithm import (
+    Algorithm,
+    Batch,
+    Logs,
+    Network,
+    Noise,
+    NoiseSpec,
+    PolicyParts,
+    Target,
+    normal,
+    setting,
+    uniform,
+)
 
-LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
-ATANH_CLIP = 0.999  # data actions at the bounds have no inverse tanh
+LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # as in CORL's code; the authors' has -5
+ATANH_CLIP = 0.999  # data actions at the bounds have no inverse tanh; the authors' code has 1 - 1e-6
 
 
 @dataclass(frozen=True)
@@ -48,9 +58,9 @@ class Config:
     tau: float = setting(0.005, "Polyak rate of the target critics", above=0, high=1)
     actor_learning_rate: float = setting(3e-5, "Adam's learning rate of the actor and temperature", above=0)
     critic_learning_rate: float = setting(3e-4, "Adam's learning rate of the critics", above=0)
-    batch_size: int = setting(256, "transitions an update", low=1)
+    batch_size: int = setting(256, "transitions per update", low=1)
     hidden: tuple[int, ...] = setting((256, 256, 256), "hidden layers of actor and critics", low=1)
-    normalize: bool = setting(False, "normalise observations by the dataset's mean and std + 1e-3")
+    normalize: bool = setting(False, "normalize observations by the dataset's mean and std + 1e-3")
 
 
 def log_prob(mean: Tensor, log_std: Tensor, u: Tensor) -> Tensor:
@@ -58,13 +68,13 @@ def log_prob(mean: Tensor, log_std: Tensor, u: Tensor) -> Tensor:
 
     log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2u)) stays finite for any u.
     """
-    normal = -0.5 * ((u - mean) / log_std.exp()).square() - log_std - 0.5 * math.log(2 * math.pi)
-    return (normal - 2 * (math.log(2) - u - softplus(-2 * u))).sum(-1)
+    density = -0.5 * ((u - mean) / log_std.exp()).square() - log_std - 0.5 * math.log(2 * math.pi)
+    return (density - 2 * (math.log(2) - u - softplus(-2 * u))).sum(-1)
 
 
 def distribution(actor: Network, observations: Tensor) -> tuple[Tensor, Tensor]:
     """Return mean and log std [runs, batch, act] of the normal before the tanh."""
-    mean, log_std = actor(observations)[0].chunk(2, -1)
+    mean, log_std = actor(observations).chunk(2, -1)
     return mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
 
 
@@ -79,7 +89,7 @@ def sample(actor: Network, observations: Tensor, noise: Tensor) -> tuple[Tensor,
     return u.tanh(), log_prob(mean, log_std, u)
 
 
-def at_each(critic: Network, observations: Tensor, actions: Tensor) -> Tensor:
+def q_of_actions(critic: Network, observations: Tensor, actions: Tensor) -> Tensor:
     """Return Q [critics, runs, n, batch] of several actions [runs, n, batch, act] at the same observations."""
     runs, n, batch, _ = actions.shape
     repeated = observations.unsqueeze(1).expand(runs, n, batch, -1)
@@ -87,140 +97,86 @@ def at_each(critic: Network, observations: Tensor, actions: Tensor) -> Tensor:
     return q.view(-1, runs, n, batch)
 
 
-def conservative_penalty(
-    critic: Network, actor: Network, batch: Batch, noise: Mapping[str, Tensor], q: Tensor
-) -> Tensor:
-    """Return mean [logsumexp_j (Q(s, a_j) - log w_j) - Q(s, a)] of each critic, [critics, runs]."""
-    with torch.no_grad():
-        here, here_log = sample(actor, batch.observations, noise["here"])
-        there, there_log = sample(actor, batch.next_observations, noise["there"])
-        uniform = noise["uniform"]
-        uniform_log = torch.full_like(here_log, uniform.shape[-1] * math.log(0.5))
-        actions = torch.cat([uniform, here, there], 1)
-        log_density = torch.cat([uniform_log, here_log, there_log], 1)
-    weighted = at_each(critic, batch.observations, actions) - log_density
-    return (weighted.logsumexp(2) - q).mean(-1)
-
-
-def critic_loss(
-    critic: Network,
-    critic_target: Target,
-    actor: Network,
-    multiplier: Tensor | None,
-    batch: Batch,
-    noise: Mapping[str, Tensor],
-    c: Any,
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the critics' loss [runs], and what is logged; `multiplier` [runs] is the Lagrange form's."""
-    with torch.no_grad():
-        next_actions, _ = sample(actor, batch.next_observations, noise["target"])
-        next_q = critic_target(batch.next_observations, next_actions[:, 0]).squeeze(-1).amin(0)
-        target = batch.rewards + c.discount * batch.masks * next_q
-    q = critic(batch.observations, batch.actions).squeeze(-1)  # [critics, runs, batch]
-    td = (q - target).square().mean(-1).sum(0)
-    penalty = c.alpha * conservative_penalty(critic, actor, batch, noise, q)  # [critics, runs]
-    logs = {"critic_loss": td.detach(), "penalty": penalty.detach().sum(0), "q_abs": q[0].detach().abs().mean(-1)}
-    if multiplier is None:
-        return td + penalty.sum(0), logs
-    return td + multiplier * (penalty - c.target_action_gap).sum(0), logs
-
-
-def actor_loss(
-    actor: Network, critic: Network, temperature: Tensor, batch: Batch, noise: Tensor, cloning: bool
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the actor's loss [runs] (cloning in the warm-up), the log-density of its actions among the logs."""
-    mean, log_std = distribution(actor, batch.observations)
-    u = mean + log_std.exp() * noise[:, 0]
-    log_pi = log_prob(mean, log_std, u)
-    if cloning:
-        data = batch.actions.clamp(-ATANH_CLIP, ATANH_CLIP).atanh()
-        value = log_prob(mean, log_std, data)
-    else:
-        value = critic.frozen(batch.observations, u.tanh()).squeeze(-1).amin(0)
-    loss = (temperature.unsqueeze(-1) * log_pi - value).mean(-1)
-    return loss, {"actor_loss": loss.detach(), "log_pi": log_pi.detach().mean(-1)}
-
-
-class CQL:
+class CQL(Algorithm[Config]):
     """A stack of CQL runs."""
 
-    Config = Config
-
-    def __init__(
-        self,
-        config: Any,
-        observation_dim: int,
-        action_dim: int,
-        run_seeds: Sequence[int],
-        device: torch.device | str,
-    ) -> None:
-        c = self.config = config
-        self.action_dim = action_dim
-        self.actor = Network(
-            (observation_dim, *c.hidden, 2 * action_dim),
-            run_seeds,
-            0,
-            learning_rate=c.actor_learning_rate,
-            device=device,
-        )
-        self.critic = Network(
-            (observation_dim + action_dim, *c.hidden, 1),
-            run_seeds,
-            1,
-            learning_rate=c.critic_learning_rate,
-            copies=2,
-            device=device,
-        )
+    def setup(self, c: Config) -> None:
+        """Make the actor (mean and log std), two critics and their target, the temperature and the multiplier."""
+        self.actor = self.actor_network(2 * self.action_dim, c.actor_learning_rate)
+        self.critic = self.critic_network(c.critic_learning_rate, ensemble_size=2)
         self.critic_target = Target(self.critic)
-        self.log_temperature = Learned(torch.zeros(1, len(run_seeds), 1, device=device), c.actor_learning_rate)
-        self.log_multiplier = Learned(torch.zeros(1, len(run_seeds), 1, device=device), c.critic_learning_rate)
-        self.learned = {
-            "actor": self.actor,
-            "critic": self.critic,
-            "critic_target": self.critic_target,
-            "log_temperature": self.log_temperature,
-            "log_multiplier": self.log_multiplier,
-        }
+        self.log_temperature = self.parameters(None, c.actor_learning_rate)
+        self.log_multiplier = self.parameters(None, c.critic_learning_rate)
 
-    @property
-    def draws(self) -> dict[str, Draw]:
-        """Normal numbers for every sampled action, uniform ones for the random actions."""
-        n, rest = self.config.num_actions, (self.config.batch_size, self.action_dim)
-        one, many = Draw((1, *rest), "normal"), Draw((n, *rest), "normal")
-        return {
-            "target": one,
-            "actor": one,
-            "here": many,
-            "there": many,
-            "uniform": Draw((n, *rest), "uniform"),
-        }
+    def noise_spec(self, c: Config) -> NoiseSpec:
+        """Return normal numbers for every sampled action, uniform ones for the random actions."""
+        one, many = (normal(n, c.batch_size, self.action_dim) for n in (1, c.num_actions))
+        random = uniform(c.num_actions, c.batch_size, self.action_dim)
+        return {"target": one, "actor": one, "here": many, "there": many, "uniform": random}
 
-    def kind(self, step: int) -> str:
-        """The actor clones first."""
-        return "cloning" if step < self.config.bc_steps else "sac"
+    def phase(self, step: int) -> bool:
+        """Return whether the actor still clones the data."""
+        return step < self.config.bc_steps
 
-    def update(self, batch: Batch, noise: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
-        """One update of every run."""
-        c = self.config
-        multiplier = self.log_multiplier.flat[0, :, 0].exp().clamp(max=1e6)  # [runs]
-        held = multiplier.detach() if c.lagrange else None
-        loss, logs = critic_loss(self.critic, self.critic_target, self.actor, held, batch, noise, c)
-        self.critic.minimize(loss.sum())
+    def conservative_penalty(self, batch: Batch, noise: Noise, q: Tensor) -> Tensor:
+        """Return mean [logsumexp_j (Q(s, a_j) - log w_j) - Q(s, a)] of each critic, [critics, runs]."""
+        with torch.no_grad():
+            here, here_log = sample(self.actor, batch.observations, noise["here"])
+            there, there_log = sample(self.actor, batch.next_observations, noise["there"])
+            random = noise["uniform"]
+            random_log = torch.full_like(here_log, random.shape[-1] * math.log(0.5))
+            actions = torch.cat([random, here, there], 1)
+            log_density = torch.cat([random_log, here_log, there_log], 1)
+        weighted = q_of_actions(self.critic, batch.observations, actions) - log_density
+        return (weighted.logsumexp(2) - q).mean(-1)
+
+    def critic_loss(self, batch: Batch, noise: Noise, multiplier: Tensor, c: Config) -> tuple[Tensor, Logs]:
+        """Return the critics' loss [runs], and what is logged; `multiplier` [runs] is the Lagrange form's."""
+        with torch.no_grad():
+            next_actions, _ = sample(self.actor, batch.next_observations, noise["target"])
+            next_q = self.critic_target(batch.next_observations, next_actions[:, 0]).amin(0)
+            target = batch.rewards + c.discount * batch.masks * next_q
+        q = self.critic(batch.observations, batch.actions)  # [critics, runs, batch]
+        td = (q - target).square().mean(-1).sum(0)
+        penalty = c.alpha * self.conservative_penalty(batch, noise, q)  # [critics, runs]
+        logs = {"critic_loss": td, "penalty": penalty.sum(0), "q_abs": q[0].abs().mean(-1)}
         if c.lagrange:
-            gap = logs["penalty"] - 2 * c.target_action_gap  # of both critics
-            self.log_multiplier.minimize(-0.5 * (multiplier * gap).sum())
-            logs["multiplier"] = multiplier.detach()
-        log_temperature = self.log_temperature.flat[0, :, 0]  # [runs]
-        temperature = log_temperature.detach().exp()
-        loss, more = actor_loss(self.actor, self.critic, temperature, batch, noise["actor"], kind == "cloning")
-        self.actor.minimize(loss.sum())
+            return td + multiplier * (penalty - c.target_action_gap).sum(0), logs
+        return td + penalty.sum(0), logs
+
+    def actor_loss(self, batch: Batch, noise: Tensor, temperature: Tensor, cloning: bool) -> Logs:
+        """Return the actor's loss (cloning in the warm-up), and the log-density of its actions."""
+        mean, log_std = distribution(self.actor, batch.observations)
+        u = mean + log_std.exp() * noise[:, 0]
+        log_pi = log_prob(mean, log_std, u)
+        if cloning:
+            data = batch.actions.clamp(-ATANH_CLIP, ATANH_CLIP).atanh()
+            value = log_prob(mean, log_std, data)
+        else:
+            value = self.critic.frozen(batch.observations, u.tanh()).amin(0)
+        loss = (temperature.unsqueeze(-1) * log_pi - value).mean(-1)
+        return {"actor_loss": loss, "log_pi": log_pi.mean(-1)}
+
+    def update(self, batch: Batch, noise: Noise, phase: bool) -> Logs:
+        """Update the critics, the actor and the temperature, then the critics' target."""
+        c = self.config
+        multiplier = self.log_multiplier.value.exp().clamp(max=1e6)
+        loss, logs = self.critic_loss(batch, noise, multiplier.detach(), c)
+        self.critic.minimize(loss)
+        if c.lagrange:
+            gap = logs["penalty"].detach() - 2 * c.target_action_gap  # of both critics
+            self.log_multiplier.minimize(-0.5 * multiplier * gap)
+            logs["multiplier"] = multiplier
+        temperature = self.log_temperature.value.detach().exp()
+        logs |= self.actor_loss(batch, noise["actor"], temperature, cloning=phase)
+        self.actor.minimize(logs["actor_loss"])
         target_entropy = -float(self.action_dim)
-        self.log_temperature.minimize(-(log_temperature * (more["log_pi"] + target_entropy)).sum())
-        self.critic_target.follow(c.tau)
-        return logs | more | {"temperature": temperature}
+        self.log_temperature.minimize(-self.log_temperature.value * (logs["log_pi"].detach() + target_entropy))
+        self.critic_target.polyak_update(c.tau)
+        return logs | {"temperature": temperature}
 
     def policy(self, run: int) -> PolicyParts:
         """Return the actor, mean and log std before the tanh; Q1 with it if it acts with the best of samples."""
         if self.config.eval_samples == 1:
-            return PolicyParts("squashed_gaussian", self.actor.layers(run))
+            return super().policy(run)
         return PolicyParts("best_by_q", self.actor.layers(run), self.critic.layers(run), self.config.eval_samples)

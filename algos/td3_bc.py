@@ -6,21 +6,19 @@ Reference: the authors' code, github.com/sfujim/TD3_BC. TD3 whose actor is also 
              loss = sum_i mean (Q_i(s, a) - y)^2
     actor    loss = -lambda mean Q_1(s, pi(s)) + mean (pi(s) - a)^2,   lambda = alpha / mean |Q_1(s, pi(s))|
 
-The actor and all targets move on every `policy_freq`-th update alone. Deviations: actions are scaled to [-1, 1], so
-the noise needs no factor of the largest action, and cloning errors count in those units (the same where the bounds
-are 1, as in the locomotion tasks); the initial weights come from NumPy.
+The actor and all targets are updated at every `policy_freq`-th update only. Deviations: actions are scaled to
+[-1, 1], so the noise needs no factor of the largest action, and cloning errors count in those units (the same where
+the bounds are 1, as in the locomotion tasks); the initial weights come from NumPy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from offbench.algorithm import Batch, Draw, Network, PolicyParts, Target, setting
+from offbench.algorithm import Algorithm, Batch, Logs, Noise, NoiseSpec, Target, normal, setting
 
 
 @dataclass(frozen=True)
@@ -35,91 +33,55 @@ class Config:
     policy_freq: int = setting(2, "updates of the critics for each of the actor and targets", low=1)
     actor_learning_rate: float = setting(3e-4, "Adam's learning rate of the actor", above=0)
     critic_learning_rate: float = setting(3e-4, "Adam's learning rate of the critics", above=0)
-    batch_size: int = setting(256, "transitions an update", low=1)
+    batch_size: int = setting(256, "transitions per update", low=1)
     hidden: tuple[int, ...] = setting((256, 256), "hidden layers of actor and critics", low=1)
-    normalize: bool = setting(True, "normalise observations by the dataset's mean and std + 1e-3")
+    normalize: bool = setting(True, "normalize observations by the dataset's mean and std + 1e-3")
 
 
-def critic_loss(
-    critic: Network, critic_target: Target, actor_target: Target, batch: Batch, noise: Tensor, c: Any
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the critics' loss [runs], and what is logged."""
-    with torch.no_grad():
-        noise = (noise * c.policy_noise).clamp(-c.noise_clip, c.noise_clip)
-        next_actions = (actor_target(batch.next_observations)[0].tanh() + noise).clamp(-1, 1)
-        next_q = critic_target(batch.next_observations, next_actions).squeeze(-1).amin(0)
-        target = batch.rewards + c.discount * batch.masks * next_q
-    q = critic(batch.observations, batch.actions).squeeze(-1)  # [critics, runs, batch]
-    loss = (q - target).square().mean(-1).sum(0)
-    return loss, {"critic_loss": loss.detach(), "q_abs": q[0].detach().abs().mean(-1)}
-
-
-def actor_loss(actor: Network, critic: Network, batch: Batch, c: Any) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the actor's loss [runs], and what is logged."""
-    pi = actor(batch.observations)[0].tanh()
-    q = critic.frozen(batch.observations, pi, copies=1)[0].squeeze(-1)  # Q1 alone: [runs, batch]
-    lambda_q = c.alpha / q.detach().abs().mean(-1) * q.mean(-1)
-    cloning = (pi - batch.actions).square().mean(-1)
-    loss = -lambda_q + cloning.mean(-1)
-    return loss, {"actor_loss": loss.detach(), "lambda_q": lambda_q.detach(), "bc": cloning.detach().mean(-1)}
-
-
-class TD3BC:
+class TD3BC(Algorithm[Config]):
     """A stack of TD3+BC runs."""
 
-    Config = Config
-
-    def __init__(
-        self,
-        config: Any,
-        observation_dim: int,
-        action_dim: int,
-        run_seeds: Sequence[int],
-        device: torch.device | str,
-    ) -> None:
-        c = self.config = config
-        self.action_dim = action_dim
-        sizes, inputs = c.hidden, observation_dim + action_dim
-        self.actor = Network(
-            (observation_dim, *sizes, action_dim),
-            run_seeds,
-            0,
-            learning_rate=c.actor_learning_rate,
-            device=device,
-        )
-        self.critic = Network(
-            (inputs, *sizes, 1), run_seeds, 1, learning_rate=c.critic_learning_rate, copies=2, device=device
-        )
+    def setup(self, c: Config) -> None:
+        """Make the actor, two critics, and the target of each."""
+        self.actor = self.actor_network(self.action_dim, c.actor_learning_rate)
+        self.critic = self.critic_network(c.critic_learning_rate, ensemble_size=2)
         self.actor_target, self.critic_target = Target(self.actor), Target(self.critic)
-        self.learned = {
-            "actor": self.actor,
-            "critic": self.critic,
-            "actor_target": self.actor_target,
-            "critic_target": self.critic_target,
-        }
 
-    @property
-    def draws(self) -> dict[str, Draw]:
-        """One normal number for each target action."""
-        return {"target": Draw((self.config.batch_size, self.action_dim), "normal")}
+    def noise_spec(self, c: Config) -> NoiseSpec:
+        """Return one normal number for each target action."""
+        return {"target": normal(c.batch_size, self.action_dim)}
 
-    def kind(self, step: int) -> str:
-        """The actor and the targets wait for every `policy_freq`-th update."""
-        return "critic+actor" if (step + 1) % self.config.policy_freq == 0 else "critic"
+    def phase(self, step: int) -> bool:
+        """Return whether the actor and the targets are updated too."""
+        return (step + 1) % self.config.policy_freq == 0
 
-    def update(self, batch: Batch, noise: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
-        """One update of every run."""
+    def critic_loss(self, batch: Batch, noise: Tensor, c: Config) -> Logs:
+        """Return the critics' loss."""
+        with torch.no_grad():
+            noise = (noise * c.policy_noise).clamp(-c.noise_clip, c.noise_clip)
+            next_actions = (self.actor_target(batch.next_observations).tanh() + noise).clamp(-1, 1)
+            next_q = self.critic_target(batch.next_observations, next_actions).amin(0)
+            target = batch.rewards + c.discount * batch.masks * next_q
+        q = self.critic(batch.observations, batch.actions)  # [critics, runs, batch]
+        return {"critic_loss": (q - target).square().mean(-1).sum(0), "q_abs": q[0].abs().mean(-1)}
+
+    def actor_loss(self, batch: Batch, pi: Tensor, c: Config) -> Logs:
+        """Return the actor's loss at its actions pi [runs, batch, act]."""
+        q = self.critic.frozen(batch.observations, pi, members=0)  # Q1 alone: [runs, batch]
+        lambda_q = c.alpha / q.detach().abs().mean(-1) * q.mean(-1)
+        cloning = (pi - batch.actions).square().mean(-1)
+        loss = -lambda_q + cloning.mean(-1)
+        return {"actor_loss": loss, "lambda_q": lambda_q, "bc": cloning.mean(-1)}
+
+    def update(self, batch: Batch, noise: Noise, phase: bool) -> Logs:
+        """Update the critics; in every `policy_freq`-th update the actor and the targets too."""
         c = self.config
-        loss, logs = critic_loss(self.critic, self.critic_target, self.actor_target, batch, noise["target"], c)
-        self.critic.minimize(loss.sum())
-        if kind == "critic+actor":
-            loss, more = actor_loss(self.actor, self.critic, batch, c)
-            self.actor.minimize(loss.sum())
-            self.actor_target.follow(c.tau)
-            self.critic_target.follow(c.tau)
-            logs |= more
+        logs = self.critic_loss(batch, noise["target"], c)
+        self.critic.minimize(logs["critic_loss"])
+        if phase:
+            pi = self.actor(batch.observations).tanh()
+            logs |= self.actor_loss(batch, pi, c)
+            self.actor.minimize(logs["actor_loss"])
+            self.actor_target.polyak_update(c.tau)
+            self.critic_target.polyak_update(c.tau)
         return logs
-
-    def policy(self, run: int) -> PolicyParts:
-        """Return the actor: tanh of its output."""
-        return PolicyParts("tanh", self.actor.layers(run))

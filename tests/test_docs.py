@@ -60,7 +60,7 @@ def test_blocks_that_do_not_run_say_why(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_the_protocol_is_told_whole() -> None:
     text = (DOCS / "extending.md").read_text()
-    protocol = ["Config", "learned", "draws", "kind", "update", "policy"]
+    protocol = ["Config", "setup", "noise_spec", "phase", "update", "policy", "learned"]
     assert all(hasattr(Algorithm, name) or name in Algorithm.__annotations__ for name in protocol)
     for name in (*protocol, *Batch._fields, *PolicyParts._fields, *KINDS, *ACTIVATIONS):
         assert re.search(rf"`[^`]*\b{name}\b[^`]*`", text), name

@@ -5,16 +5,19 @@ reads and writes, and replayed with them. Views are made once, outputs stay in p
 same kernels run in the same order on the same numbers, so a replayed update has the bits of an eager one.
 
 An update can be replayed if it always does the same operations: it may not read numbers into Python, draw random
-numbers, or depend on a counter of its own. `record` notices the first two, comparing two records the third.
+numbers, or depend on anything but tensors that changes. `record` notices the first two, comparing records and
+`attributes` the third.
 """
 
 from __future__ import annotations
 
+import collections
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
@@ -164,6 +167,48 @@ class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
             constant = func.overloadpacket.__name__ in _CONSTANTS
             self.recording.add(func, (args, kwargs), result, call, constant=constant)
         return result
+
+
+def attributes(thing: Any) -> dict[str, Any]:
+    """Return the attributes of an object, to be compared with a later state by `changed_attribute`.
+
+    Numbers, texts and the contents of lists, dicts, sets and plain objects count by value, anything else by identity.
+    What a checkpoint keeps, and tensors changed in place, do not count: a replay changes them too.
+    """
+    return {name: _state(value, frozenset()) for name, value in vars(thing).items()}
+
+
+def changed_attribute(before: dict[str, Any], after: dict[str, Any], *, first: bool) -> str | None:
+    """Return the name of an attribute that has changed, None if none has.
+
+    Args:
+        first: whether the update between was a phase's first, which may set attributes that were absent or None.
+    """
+    for name, value in after.items():
+        old = before.get(name)
+        if old != value and not (first and old in (None, _state(None, frozenset()))):
+            return name
+    return next((name for name in before if name not in after), None)
+
+
+def _state(value: Any, above: frozenset[int]) -> Any:
+    """Return what of a value can change, as something comparable."""
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes):
+        return type(value).__name__, repr(value)  # NaN equals itself so
+    if id(value) in above or isinstance(value, type | Tensor) or callable(getattr(value, "tensors", None)):
+        return id(value)
+    inner = above | {id(value)}
+    if isinstance(value, dict):
+        return [(repr(key), _state(item, inner)) for key, item in value.items()]
+    if isinstance(value, list | tuple | collections.deque):
+        return [_state(item, inner) for item in value]
+    if isinstance(value, set | frozenset):
+        return sorted(map(repr, value))
+    if isinstance(value, np.ndarray):
+        return value.shape, str(value.dtype), value.tobytes()
+    if hasattr(value, "__dict__"):
+        return id(value), [(name, _state(item, inner)) for name, item in vars(value).items()]
+    return id(value), repr(value)
 
 
 def _single(func: Any, args: Any, kwargs: Any) -> Call:

@@ -1,13 +1,12 @@
-"""What an algorithm is.
+"""What an algorithm is: a subclass of `Algorithm`.
 
-    class Config            frozen dataclass of `setting`s: CLI flags, help, config.json; the training itself
-                            reads batch_size, normalize and, if there is one, top (share of best episodes)
-    class Algorithm(config, observation_dim, action_dim, run_seeds, device)
-        draws               the random numbers of one update, by name
-        kind(step)          which sort of update comes at a step
-        update(batch, noise, kind) -> {name: [runs]}
-        learned             {name: Network, Target or Learned}: all that a checkpoint keeps
-        policy(run)         the policy file's kind and layers
+    Config                      frozen dataclass of `setting`s: CLI flags, help, config.json; the training itself
+                                reads batch_size, normalize and, if there is one, top (share of best episodes)
+    setup(c)                    makes the networks; every one that is an attribute is part of a checkpoint
+    noise_spec(c)               the random numbers of one update, by name
+    phase(step)                 which sort of update comes at a step
+    update(batch, noise, phase) one update, in place; returns {name: [runs]}, the columns of losses.csv
+    policy(run)                 the policy file's kind and layers
 
 Every tensor has the run axis first; runs of a stack share shapes and every setting that is not `per_run`.
 """
@@ -15,24 +14,35 @@ Every tensor has the run axis first; runs of a stack share shapes and every sett
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import typing
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from types import SimpleNamespace
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import TypeVar
 
+from offbench.algorithm.networks import Network, Parameters, Schedule
 from offbench.common.errors import OffbenchError
+
+C = TypeVar("C", default=Any)
+
+NOT_LOADED = torch.empty(0, device="meta")  # an operation on it fails
 
 
 class Batch(NamedTuple):
     """Transitions of one update.
 
     Attributes:
-        observations, next_observations: [runs, batch, obs], normalised if the settings say so.
+        observations, next_observations: [runs, batch, obs], normalized if the settings say so.
         actions: [runs, batch, act] in [-1, 1].
         rewards: [runs, batch].
         masks: [runs, batch], 1 - terminations: 0 where nothing is left to bootstrap from.
+        next_actions: [runs, batch, act], the data's actions at the next observations; only for an algorithm that sets
+            `uses_next_actions`.
+        next_action_masks: [runs, batch], 0 where the data has no next action, at the end of an episode: next_actions
+            holds zeros there.
     """
 
     observations: Tensor
@@ -40,17 +50,34 @@ class Batch(NamedTuple):
     rewards: Tensor
     next_observations: Tensor
     masks: Tensor
+    next_actions: Tensor = NOT_LOADED
+    next_action_masks: Tensor = NOT_LOADED
 
 
-class Draw(NamedTuple):
-    """Random numbers of one update of one run: their shape and how they are distributed."""
+class Distribution(NamedTuple):
+    """The shape and distribution of random numbers for one update of one run."""
 
     shape: tuple[int, ...]
-    distribution: Literal["normal", "uniform"]  # uniform in [-1, 1]
+    name: Literal["normal", "uniform"]
+
+
+def normal(*shape: int) -> Distribution:
+    """Return the standard normal distribution, for an array of a shape."""
+    return Distribution(shape, "normal")
+
+
+def uniform(*shape: int) -> Distribution:
+    """Return the uniform distribution in [-1, 1], for an array of a shape."""
+    return Distribution(shape, "uniform")
+
+
+NoiseSpec = dict[str, Distribution]
+Noise = Mapping[str, Tensor]  # each [runs, *shape]
+Logs = dict[str, Tensor]  # each [runs]
 
 
 class PolicyParts(NamedTuple):
-    """A policy file's kind (see offbench/policy.py) and weights, each layer (weight [in, out], bias [out]).
+    """A policy file's kind (see offbench/rollouts/policy.py) and weights, each layer (weight [in, out], bias [out]).
 
     Attributes:
         activation: between the layers, `relu` or `tanh`.
@@ -64,43 +91,133 @@ class PolicyParts(NamedTuple):
     activation: str = "relu"
 
 
-class Keeps(Protocol):
-    """Something whose tensors belong into a checkpoint (a network, a target, a temperature)."""
+class Learned(Protocol):
+    """Something whose tensors belong into a checkpoint: a network, a target, a temperature."""
 
-    def tensors(self) -> dict[str, Tensor]: ...
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors by name, each [ensemble, runs, ...] or []: a resume writes into them."""
+        ...
 
 
-class Algorithm(Protocol):
-    """A stack of runs of one algorithm."""
+class Algorithm(Generic[C]):
+    """A stack of runs of one algorithm: `class TD3BC(Algorithm[Config])`, Config being its settings.
+
+    Args:
+        config: what `stack_configs` returns for the runs' Configs: each setting that is `per_run` is a tensor [runs].
+        run_seeds: one seed for each run.
+
+    Attributes:
+        capture: whether updates may be recorded and replayed, which is faster. A replay repeats tensor operations
+            alone, so all updates of a phase must do the same.
+        uses_next_actions: whether batches hold `next_actions`.
+    """
 
     Config: ClassVar[type]
-    learned: Mapping[str, Keeps]
+    capture: ClassVar[bool] = True
+    uses_next_actions: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for base in cls.__dict__.get("__orig_bases__", ()):
+            if typing.get_origin(base) is Algorithm and isinstance(typing.get_args(base)[0], type):
+                cls.Config = typing.get_args(base)[0]
 
     def __init__(
         self,
-        config: Any,
+        config: C,
         observation_dim: int,
         action_dim: int,
         run_seeds: Sequence[int],
         device: torch.device | str,
-    ) -> None: ...
+    ) -> None:
+        self.config = config
+        self.observation_dim, self.action_dim = observation_dim, action_dim
+        self.run_seeds, self.device = tuple(run_seeds), torch.device(device)
+        self._networks = 0  # made so far: the index of the next, which its initial weights depend on
+        self.setup(config)
 
-    @property
-    def draws(self) -> dict[str, Draw]:
-        """The random numbers that each update gets, beside the batch."""
-        ...
+    def setup(self, c: C) -> None:
+        """Make the networks, as attributes. The order of creation is part of what a seed means."""
+        raise NotImplementedError(f"{type(self).__name__} has no setup(c)")
 
-    def kind(self, step: int) -> str:
-        """Return which sort of update comes at `step` (from 0)."""
-        ...
+    def noise_spec(self, c: C) -> NoiseSpec:
+        """Return the random numbers that each update gets; nothing else in an update may be random."""
+        return {}
 
-    def update(self, batch: Batch, noise: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
-        """Do one update in place; return what is logged, each [runs]."""
-        ...
+    def phase(self, step: int) -> Hashable:
+        """Return which sort of update comes at `step`, from 0. All updates of a phase do the same operations."""
+        return None
+
+    def update(self, batch: Batch, noise: Noise, phase: Any) -> Logs:
+        """Do one update of every run; return what is logged, the same names for a phase."""
+        raise NotImplementedError(f"{type(self).__name__} has no update(batch, noise, phase)")
 
     def policy(self, run: int) -> PolicyParts:
-        """Return what the policy file of one run is made of."""
-        ...
+        """Return what the policy file of one run is made of; by default the network `actor`.
+
+        It is a `tanh` policy, or a `squashed_gaussian` if the network has two outputs for each action dimension.
+        """
+        actor: Network = self.actor  # type: ignore[attr-defined]
+        kind = "tanh" if actor.sizes[-1] == self.action_dim else "squashed_gaussian"
+        return PolicyParts(kind, actor.layers(run), activation=actor.activation)
+
+    @property
+    def learned(self) -> dict[str, Learned]:
+        """Everything that a checkpoint keeps: networks, targets and parameters among the attributes, by name."""
+        return dict(_learned("", vars(self)))
+
+    def network(
+        self,
+        inputs: int,
+        outputs: int | None,
+        learning_rate: float | Schedule,
+        *,
+        hidden: Sequence[int] | None = None,
+        **options: Any,
+    ) -> Network:
+        """Return a network for each run.
+
+        Args:
+            outputs: None for one number, whose axis is left out.
+            hidden: widths of the hidden layers; the setting `hidden` by default.
+            options: ensemble_size, activation, norm, weight_decay, twice_differentiable: see `Network`.
+        """
+        config: Any = self.config
+        widths = config.hidden if hidden is None else hidden
+        index, self._networks = self._networks, self._networks + 1
+        options = {"learning_rate": learning_rate, "device": self.device} | options
+        return Network(inputs, widths, outputs, self.run_seeds, index, **options)
+
+    def actor_network(self, outputs: int, learning_rate: float | Schedule, **options: Any) -> Network:
+        """Return a network from observations to `outputs`: [runs, batch, outputs]."""
+        return self.network(self.observation_dim, outputs, learning_rate, **options)
+
+    def critic_network(
+        self, learning_rate: float | Schedule, ensemble_size: int | None = 2, **options: Any
+    ) -> Network:
+        """Return an ensemble from observations and actions to a number: [ensemble, runs, batch]."""
+        inputs = self.observation_dim + self.action_dim
+        return self.network(inputs, None, learning_rate, ensemble_size=ensemble_size, **options)
+
+    def value_network(self, learning_rate: float | Schedule, **options: Any) -> Network:
+        """Return a network from observations to a number: [runs, batch]."""
+        return self.network(self.observation_dim, None, learning_rate, **options)
+
+    def parameters(self, size: int | None, learning_rate: float | Schedule, initial: float = 0.0) -> Parameters:
+        """Return `size` numbers for each run, `value` [runs, size], or one, `value` [runs], if `size` is None."""
+        flat = torch.full((1, len(self.run_seeds), size or 1), initial, device=self.device)
+        return Parameters(flat, learning_rate, scalar=size is None)
+
+
+def _learned(prefix: str, values: Mapping[Any, Any]) -> Iterator[tuple[str, Learned]]:
+    """Yield the learned parts among values, those in lists and dicts too, with their names: `critic`, `critics.0`."""
+    for name, value in values.items():
+        if isinstance(value, list | tuple):
+            value = dict(enumerate(value))
+        if isinstance(value, dict):
+            yield from _learned(f"{prefix}{name}.", value)
+        elif callable(getattr(value, "tensors", None)):
+            yield f"{prefix}{name}", value
 
 
 def check_logs(logs: Any, runs: int, where: str) -> None:
@@ -110,16 +227,43 @@ def check_logs(logs: Any, runs: int, where: str) -> None:
     for name, value in logs.items():
         tensor = isinstance(value, Tensor)
         if not tensor or value.shape != (runs,):
-            found = f"one {list(value.shape)}" if tensor else f"a {type(value).__name__}"
-            raise OffbenchError(f"{where}: log {name!r} must be a tensor [runs] = [{runs}], got {found}")
-        if value.requires_grad:  # the sums of logs would keep the graph of every update
-            raise OffbenchError(f"{where}: log {name!r} must be detached: {name}.detach()")
+            got = f"one {list(value.shape)}" if tensor else f"a {type(value).__name__}"
+            raise OffbenchError(f"{where}: log {name!r} must be a tensor [runs] = [{runs}], got {got}")
+
+
+class _NumbersOrWords(NamedTuple):
+    """A setting that is a number in some runs of a stack and a word in others."""
+
+    numbers: Tensor  # [runs], NaN where it is a word
+    words: dict[str, Tensor]  # [runs] of each word: whether the run has it
+
+
+def per_sample(value: Any, **words: Tensor) -> Tensor:
+    """Return a `per_run` setting as [runs, 1], to combine with [runs, batch].
+
+    Args:
+        words: of a setting that may also be a word: what stands for the word, [runs, batch]. The result then has
+            that shape.
+    """
+    if not isinstance(value, _NumbersOrWords):
+        result: Tensor = value.unsqueeze(-1)
+        return result
+    result = value.numbers.unsqueeze(-1)
+    for word, tensor in words.items():
+        result = torch.where(value.words[word].unsqueeze(-1), tensor, result)
+    return result
+
+
+def has_word(value: Any, word: str) -> Tensor:
+    """Return in which runs a `per_run` setting is a word, [runs]."""
+    mask: Tensor = value.words[word]
+    return mask
 
 
 def stack_configs(configs: Sequence[Any], device: torch.device | str) -> Any:
     """Return one config for a stack: `per_run` settings as tensors [runs], the others as they are.
 
-    A word among numbers (beta = "adaptive") becomes -1 minus its place among the setting's choices.
+    A `per_run` setting that may be a word (beta = "adaptive") is read by `per_sample`.
 
     Raises:
         OffbenchError: the runs differ in a setting that cannot differ within a stack.
@@ -128,9 +272,13 @@ def stack_configs(configs: Sequence[Any], device: torch.device | str) -> Any:
     for field in dataclasses.fields(configs[0]):
         column = [getattr(config, field.name) for config in configs]
         if field.metadata.get("per_run"):
-            words = field.metadata.get("choices") or ()
-            numbers = [-1.0 - words.index(value) if isinstance(value, str) else float(value) for value in column]
-            values[field.name] = torch.tensor(numbers, dtype=torch.float32, device=device)
+            numbers = [float("nan") if isinstance(value, str) else float(value) for value in column]
+            tensor = torch.tensor(numbers, dtype=torch.float32, device=device)
+            words = {
+                word: torch.tensor([value == word for value in column], device=device)
+                for word in field.metadata.get("choices") or ()
+            }
+            values[field.name] = _NumbersOrWords(tensor, words) if words else tensor
         elif any(value != column[0] for value in column):
             raise OffbenchError(f"runs of one stack cannot differ in {field.name}")
         else:

@@ -1,9 +1,9 @@
 """The forward and backward pass of many equal perceptrons.
 
-    flat [copies, runs, P] = W0 [in, h] | b0 [h] | W1 [h, h] | b1 [h] | ... | 0
-    inputs [runs, batch, dim], concatenated to x [runs, batch, in]   ->   outputs [copies, runs, batch, out]
+    flat [ensemble, runs, P] = W0 [in, h] | b0 [h] | W1 [h, h] | b1 [h] | ... | 0
+    inputs [runs, batch, dim], concatenated to x [runs, batch, in]   ->   outputs [ensemble, runs, batch, out]
 
-On a GPU a layer of all perceptrons is one batched product, and autograd does the way back (`stacked`).
+On a GPU a layer of all perceptrons is one batched product, and autograd computes the gradients (`stacked`).
 
 On a CPU one perceptron goes after the other, so that its arrays stay in the cache, and its passes are written out
 (`Pass`): buffers are kept between calls, products are NumPy's (OpenBLAS writes into them), and only gradients that
@@ -30,6 +30,7 @@ import torch
 from torch import Tensor
 
 from offbench.algorithm.capture import one_call
+from offbench.algorithm.stacked import layers_of, one_by_one, stacked
 
 _WAY = ContextVar("way", default="numpy")
 Array = np.ndarray[Any, np.dtype[np.float32]]
@@ -38,18 +39,31 @@ ALIGNED = 16  # float32 numbers of 64 bytes: rows of buffers begin where a proce
 NARROW = 64  # a product with fewer inputs or outputs gains nothing from bfloat16 on a CPU
 
 
-def perceptrons(flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str) -> Tensor:
-    """Return the outputs [copies, runs, batch, out] of perceptrons with layers of `sizes`, differentiable once.
+def perceptrons(
+    flat: Tensor,
+    inputs: Sequence[Tensor],
+    sizes: Sequence[int],
+    activation: str,
+    norm: str = "none",
+    twice: bool = False,
+) -> Tensor:
+    """Return the outputs [ensemble, runs, batch, out] of perceptrons with layers of `sizes`.
 
     Args:
-        flat: all weights and biases [copies, runs, P]; what lies behind the last bias has no effect.
+        flat: all weights and biases [ensemble, runs, P]; what lies behind the last bias has no effect.
         inputs: each [runs, batch, dim].
         activation: of the hidden layers, relu or tanh.
+        norm: LayerNorm of the hidden layers: none, before or after the activation. `flat` then has a gain and a shift
+            behind each hidden layer's bias.
+        twice: whether the outputs must be differentiable twice. The passes written out for a CPU are differentiable
+            once; these networks, and those with LayerNorm, are PyTorch's own operations, which cost more.
     """
     way = _WAY.get()
     half = way == "bfloat16"
     if flat.device.type != "cpu" or flat.dtype != torch.float32 or way == "pytorch":
-        return stacked(flat, inputs, sizes, activation, torch.bfloat16 if half else None)
+        return stacked(flat, inputs, sizes, activation, norm, torch.bfloat16 if half else None)
+    if norm != "none" or twice:
+        return one_by_one(flat, inputs, sizes, activation, norm, torch.bfloat16 if half else None)
     outputs: Tensor = _Perceptrons.apply(flat, tuple(sizes), activation, half, *inputs)  # type: ignore[no-untyped-call]
     return outputs
 
@@ -66,40 +80,6 @@ def products_by(way: str) -> Iterator[None]:
         yield
     finally:
         _WAY.reset(token)
-
-
-def stacked(
-    flat: Tensor,
-    inputs: Sequence[Tensor],
-    sizes: Sequence[int],
-    activation: str,
-    dtype: torch.dtype | None = None,
-) -> Tensor:
-    """Return what `perceptrons` does, all of them at once, differentiable as often as one likes.
-
-    Args:
-        dtype: of all products but the last layer's; by default that of `flat`, as the last layer's always is: a Q of
-            300 needs more than bfloat16's 8 bits.
-    """
-    x = torch.cat(list(inputs), -1)
-    copies, (runs, batch, width) = flat.shape[0], x.shape
-    h = x.expand(copies, runs, batch, width).reshape(copies * runs, batch, width)
-    layers = _layers(flat.reshape(copies * runs, -1), sizes)
-    for both in layers[:-1]:
-        both = both.to(dtype or flat.dtype)
-        h = torch.baddbmm(both[:, -1:], h.to(both.dtype), both[:, :-1])
-        h = h.relu() if activation == "relu" else h.tanh()
-    last = layers[-1]
-    return torch.baddbmm(last[:, -1:], h.to(last.dtype), last[:, :-1]).view(copies, runs, batch, -1)
-
-
-def _layers(flat: Tensor, sizes: Sequence[int]) -> list[Tensor]:
-    """Return each layer's weights and bias as one matrix [.., in + 1, out], views of `flat` [.., P]."""
-    layers, first = [], 0
-    for i, o in itertools.pairwise(sizes):
-        layers.append(flat[..., first : first + (i + 1) * o].view(*flat.shape[:-1], i + 1, o))
-        first += (i + 1) * o
-    return layers
 
 
 class _Perceptrons(torch.autograd.Function):
@@ -148,8 +128,8 @@ class Pass:
         half: bool = False,
     ) -> None:
         self.sizes, self.activation = sizes, activation
-        self.shape = (flat.shape[0], *inputs[0].shape[:2])  # copies, runs, batch
-        copies, runs, batch = self.shape
+        self.shape = (flat.shape[0], *inputs[0].shape[:2])  # ensemble, runs, batch
+        ensemble, runs, batch = self.shape
         self.widths = [x.shape[-1] for x in inputs]
         self.outputs = torch.empty(*self.shape, sizes[-1])
         x = [_with_ones(batch, sizes[0]) for _ in range(runs)]
@@ -159,28 +139,28 @@ class Pass:
             for start, end, part in zip(starts, starts[1:], (_array(part) for part in inputs), strict=False)
             for run in range(runs)
         ]
-        self.layers = [_array(layer) for layer in _layers(flat, sizes)]  # each [copies, runs, in + 1, out]
+        self.layers = [_array(layer) for layer, _ in layers_of(flat, sizes)]  # each [ensemble, runs, in + 1, out]
         # what goes into each layer, [batch, in + 1], of each perceptron
         self.into: dict[tuple[int, int], list[Array]] = {}
         self.halves: dict[tuple[int, int, int], _Half] = {}  # the layers in bfloat16, of each perceptron
         self._steps: list[tuple[Callable[..., Any], tuple[Any, ...], Callable[[], Any] | None]] = []
         outputs = _array(self.outputs)
-        for copy, run in itertools.product(range(copies), range(runs)):
-            h, self.into[copy, run] = x[run], [x[run]]
+        for member, run in itertools.product(range(ensemble), range(runs)):
+            h, self.into[member, run] = x[run], [x[run]]
             for layer, width in enumerate(sizes[1:-1]):
                 make = _with_ones if keep else _shared(f"layer {layer}", _with_ones)
                 into = make(batch, width)
                 hidden = torch.from_numpy(into[:, :-1])
                 activate = hidden.relu_ if activation == "relu" else hidden.tanh_
-                weight = self.layers[layer][copy, run]
+                weight = self.layers[layer][member, run]
                 if half and min(sizes[layer], width) >= NARROW:
-                    product = self.halves[copy, run, layer] = _Half(h, weight, into[:, :-1], keep)
+                    product = self.halves[member, run, layer] = _Half(h, weight, into[:, :-1], keep)
                     self._steps.append((product.forward, (), activate))
                 else:
                     self._steps.append((np.matmul, (h, weight, into[:, :-1]), activate))
                 h = into
-                self.into[copy, run].append(into)
-            self._steps.append((np.matmul, (h, self.layers[-1][copy, run], outputs[copy, run]), None))
+                self.into[member, run].append(into)
+            self._steps.append((np.matmul, (h, self.layers[-1][member, run], outputs[member, run]), None))
 
     def run(self) -> None:
         """Compute `outputs`."""
@@ -202,10 +182,12 @@ class PassBack:
     def __init__(
         self, forward: Pass, flat: Tensor, grad: Tensor, needs_flat: bool, needs_inputs: Sequence[bool]
     ) -> None:
-        copies, runs, batch = forward.shape
+        ensemble, runs, batch = forward.shape
         sizes, widths = forward.sizes, forward.widths
         self.of_flat = torch.zeros_like(flat) if needs_flat else None
-        of_layers = [_array(layer) for layer in _layers(self.of_flat, sizes)] if self.of_flat is not None else None
+        of_layers = None
+        if self.of_flat is not None:
+            of_layers = [_array(layer) for layer, _ in layers_of(self.of_flat, sizes)]
         self.of_inputs = [
             torch.empty(runs, batch, width) if needed else None
             for width, needed in zip(widths, needs_inputs, strict=True)
@@ -215,15 +197,15 @@ class PassBack:
         if not grad.is_contiguous():
             last = np.empty(grad.shape, np.float32)
             self._calls.append((np.copyto, (last, _array(grad))))
-        for copy, run in itertools.product(range(copies), range(runs)):
-            g = last[copy, run]
+        for member, run in itertools.product(range(ensemble), range(runs)):
+            g = last[member, run]
             for layer in reversed(range(len(sizes) - 1)):
-                h, weight = forward.into[copy, run][layer], forward.layers[layer][copy, run][:-1]
-                half = forward.halves.get((copy, run, layer))
+                h, weight = forward.into[member, run][layer], forward.layers[layer][member, run][:-1]
+                half = forward.halves.get((member, run, layer))
                 if half is not None:
                     self._calls.append((half.load, (torch.from_numpy(g),)))
                 if of_layers is not None:
-                    of_layer = of_layers[layer][copy, run]
+                    of_layer = of_layers[layer][member, run]
                     if half is None:
                         self._calls.append((np.matmul, (h.T, g, of_layer)))
                     else:
@@ -241,7 +223,7 @@ class PassBack:
                 for width, found in zip(widths, self.of_inputs, strict=True):
                     if found is not None:
                         part, of_input = weight[start : start + width].T, _array(found)[run]
-                        if copy == 0:
+                        if member == 0:
                             self._product(g, part, of_input)
                         else:
                             other = _shared("gradient of an input", _rows)(batch, width)

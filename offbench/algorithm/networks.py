@@ -1,17 +1,18 @@
 """Stacked networks: every parameter of one network of all runs lies in one flat tensor.
 
-    flat [copies, runs, P]          copies: 1 actor, or the M critics of a run
+    flat [ensemble, runs, P]        ensemble: 1 actor, or the M critics of a run
       = W0 [.., in, h] | b0 [.., h] | W1 [.., h, h] | b1 [.., h] | ... | 0      (x @ W + b)
 
-One call serves all copies and runs (offbench.algorithm.mlp), and Adam and Polyak are one pass over one tensor. Runs
-share nothing, so the gradient of the runs' summed losses is each run's own gradient.
+One call computes all members and runs (offbench.algorithm.mlp), and Adam and Polyak averaging are one pass over one
+tensor. Runs share nothing, so the gradient of the runs' summed losses is each run's own gradient.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -21,35 +22,61 @@ from torch.optim.adam import adam
 
 from offbench.algorithm.mlp import perceptrons
 from offbench.common import seeds
+from offbench.common.errors import OffbenchError
 from offbench.common.seeds import Purpose
 
 # What a run learns is stored in multiples of this many numbers, so that each run begins where a processor's wide
 # registers do: loops round what is left at their end differently, and a run must be the same alone and in a stack.
 ALIGNED = 16
 
+Schedule = Callable[[Tensor], Tensor]  # from the number of earlier steps, a tensor [], to the learning rate
 
-class Learned:
-    """A flat tensor [copies, runs, P] that Adam moves. Runs are axis 1, in every tensor of `tensors()`."""
 
-    def __init__(self, flat: Tensor, learning_rate: float) -> None:
+def cosine_decay(learning_rate: float, steps: int) -> Schedule:
+    """Return a learning rate that falls from `learning_rate` to 0 over `steps` steps, along half a cosine."""
+    return lambda step: 0.5 * learning_rate * (1 + torch.cos(math.pi * (step / steps).clamp(max=1)))
+
+
+def linear_decay(learning_rate: float, steps: int) -> Schedule:
+    """Return a learning rate that falls from `learning_rate` to 0 over `steps` steps, along a line."""
+    return lambda step: learning_rate * (1 - (step / steps).clamp(max=1))
+
+
+class Parameters:
+    """A flat tensor [ensemble, runs, P] that Adam moves. Runs are axis 1, in every tensor of `tensors()`.
+
+    Args:
+        learning_rate: Adam's; a number, or a function of the number of earlier steps (`cosine_decay`).
+        weight_decay: decoupled from the gradient, as in AdamW; of all parameters.
+        scalar: whether `value` lacks its last axis.
+    """
+
+    def __init__(
+        self, flat: Tensor, learning_rate: float | Schedule, *, weight_decay: float = 0.0, scalar: bool = False
+    ) -> None:
         self._spare = -flat.shape[-1] % ALIGNED
         self._whole = pad(flat, (0, self._spare)) if self._spare else flat
         self.flat = self._whole[..., : flat.shape[-1]].requires_grad_()
-        self.learning_rate = learning_rate
+        self.learning_rate, self.weight_decay, self._scalar = learning_rate, weight_decay, scalar
         self.state: dict[str, Tensor] = {
             "step": torch.zeros((), dtype=torch.float32, device=flat.device),
             "exp_avg": torch.zeros_like(self._whole),
             "exp_avg_sq": torch.zeros_like(self._whole),
         }
 
+    @property
+    def value(self) -> Tensor:
+        """The numbers of each run: [runs, P], or [runs] of a scalar."""
+        return self.flat[0, :, 0] if self._scalar else self.flat[0]
+
     def minimize(self, loss: Tensor, retain_graph: bool = False) -> None:
-        """Take one Adam step down the gradient of `loss` (runs summed), for these parameters alone."""
-        (grad,) = torch.autograd.grad(loss, [self.flat], retain_graph=retain_graph)
-        self.descend(grad)
+        """Take one Adam step down the gradient of `loss` [runs], for these parameters alone."""
+        minimize(loss, self, retain_graph=retain_graph)
 
     @torch.no_grad()
-    def descend(self, grad: Tensor) -> None:
-        """Take one Adam step down a gradient [copies, runs, P]: torch's function, its class costs twice the time."""
+    def adam_step(self, grad: Tensor) -> None:
+        """Take one Adam step down a gradient [ensemble, runs, P], by PyTorch's function: its class is slower."""
+        rate = self.learning_rate
         adam(
             [self._whole],
             [pad(grad, (0, self._spare)) if self._spare else grad],
@@ -58,86 +85,131 @@ class Learned:
             [],
             [self.state["step"]],
             fused=True,
+            decoupled_weight_decay=self.weight_decay > 0,
             amsgrad=False,
             beta1=0.9,
             beta2=0.999,
-            lr=self.learning_rate,
-            weight_decay=0.0,
+            lr=rate(self.state["step"]) if callable(rate) else rate,
+            weight_decay=self.weight_decay,
             eps=1e-8,
             maximize=False,
         )
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return what a checkpoint keeps, each [copies, runs, P] but for the step count."""
+        """Return what a checkpoint keeps, each [ensemble, runs, P] but for the step count."""
         return {"flat": self._whole, **self.state}
 
 
-class Network(Learned):
-    """Multilayer perceptrons of one shape, `copies` for each run, with PyTorch's default initial weights.
+def minimize(loss: Tensor, *parts: Parameters, retain_graph: bool = False) -> None:
+    """Take one Adam step of each part down the gradient of `loss` [runs]; all gradients come before the steps."""
+    grads = torch.autograd.grad(loss.sum(), [part.flat for part in parts], retain_graph=retain_graph)
+    for part, grad in zip(parts, grads, strict=True):
+        part.adam_step(grad)
+
+
+class Network(Parameters):
+    """Multilayer perceptrons of one shape, with PyTorch's default initial weights.
 
     Args:
-        sizes: widths of all layers, inputs first.
-        run_seeds: one seed a run; a run's weights depend on its seed and on `index` alone.
+        inputs: width of the inputs, concatenated.
+        hidden: widths of the hidden layers.
+        outputs: width of the outputs; None for one number, whose axis is left out.
+        run_seeds: one seed for each run; a run's weights depend on its seed and on `index` alone.
         index: tells an algorithm's networks apart.
+        ensemble_size: perceptrons for each run; None for one, whose axis is left out.
+        activation: of the hidden layers, relu or tanh.
+        norm: LayerNorm in the hidden layers, before or after the activation.
+        twice_differentiable: whether gradients of gradients are needed (a gradient penalty); costs more on a CPU.
     """
 
     def __init__(
         self,
-        sizes: Sequence[int],
+        inputs: int,
+        hidden: Sequence[int],
+        outputs: int | None,
         run_seeds: Sequence[int],
         index: int,
         *,
-        learning_rate: float,
-        copies: int = 1,
-        activation: str = "relu",
+        learning_rate: float | Schedule,
+        ensemble_size: int | None = None,
+        activation: Literal["relu", "tanh"] = "relu",
+        norm: Literal["none", "before", "after"] = "none",
+        twice_differentiable: bool = False,
+        weight_decay: float = 0.0,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.sizes, self.copies, self.runs = tuple(sizes), copies, len(run_seeds)
-        self.activation = activation
+        self.sizes, self.runs = (inputs, *hidden, outputs or 1), len(run_seeds)
+        self.ensemble_size = ensemble_size or 1
+        self._squeezed = [axis for axis, size in ((-1, outputs), (0, ensemble_size)) if size is None]
+        self.activation, self.norm, self.twice_differentiable = activation, norm, twice_differentiable
         self._shapes = list(itertools.pairwise(self.sizes))
-        self._splits = [n for i, o in self._shapes for n in (i * o, o)]
-        flat = np.stack([[self._initial(seed, index, copy) for seed in run_seeds] for copy in range(copies)])
-        super().__init__(torch.from_numpy(flat).to(device), learning_rate)
+        members = range(self.ensemble_size)
+        flat = np.stack([[self._initial(seed, index, member) for seed in run_seeds] for member in members])
+        super().__init__(torch.from_numpy(flat).to(device), learning_rate, weight_decay=weight_decay)
 
-    def _initial(self, seed: int, index: int, copy: int) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+    def _initial(self, seed: int, index: int, member: int) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
         """Draw one network: U(-1/sqrt(fan_in), 1/sqrt(fan_in)) for weights and biases, as torch.nn.Linear."""
-        rng = seeds.generator(seed, Purpose.WEIGHTS, index, copy)
-        bounds = [1 / math.sqrt(i) for i, o in self._shapes for _ in range(2)]
-        parts = [rng.uniform(-b, b, n) for b, n in zip(bounds, self._splits, strict=True)]
-        parts.append(np.zeros(-sum(self._splits) % ALIGNED))
+        rng = seeds.generator(seed, Purpose.WEIGHTS, index, member)
+        parts = []
+        for layer, (i, o) in enumerate(self._shapes):
+            parts += [rng.uniform(-1 / math.sqrt(i), 1 / math.sqrt(i), n) for n in (i * o, o)]
+            if self.norm != "none" and layer < len(self._shapes) - 1:
+                parts += [np.ones(o), np.zeros(o)]
+        parts.append(np.zeros(-sum(map(len, parts)) % ALIGNED))
         return np.concatenate(parts).astype(np.float32)
 
     def __call__(self, *inputs: Tensor) -> Tensor:
-        """Return the outputs [copies, runs, batch, out] for inputs [runs, batch, dim], concatenated."""
+        """Return the outputs for inputs [runs, batch, dim], concatenated.
+
+        They are [ensemble, runs, batch, out]; without the ensemble's axis where there is no ensemble, and without the
+        last axis where the outputs are one number.
+        """
         return self.forward(self.flat, *inputs)
 
-    def frozen(self, *inputs: Tensor, first: int = 0, copies: int | None = None) -> Tensor:
-        """Like a call, with no gradient to the weights, of the copies from `first` up to `copies` alone."""
-        return self.forward(self.flat.detach()[first:copies], *inputs)
+    def frozen(self, *inputs: Tensor, members: int | slice = slice(None)) -> Tensor:
+        """Like a call, with no gradient to the weights.
+
+        Args:
+            members: of the ensemble: one, whose axis is left out, or a slice.
+        """
+        if isinstance(members, slice):
+            return self.forward(self.flat.detach()[members], *inputs)
+        outputs = self.forward(self.flat.detach()[members : members + 1], *inputs)
+        return outputs if 0 in self._squeezed else outputs.squeeze(0)
 
     def forward(self, flat: Tensor, *inputs: Tensor) -> Tensor:
-        """Return the outputs [copies, runs, batch, out] of the networks in `flat`."""
-        return perceptrons(flat, inputs, self.sizes, self.activation)
+        """Return the outputs of the networks in `flat`, as a call does."""
+        outputs = perceptrons(flat, inputs, self.sizes, self.activation, self.norm, self.twice_differentiable)
+        for axis in self._squeezed:
+            outputs = outputs.squeeze(axis)
+        return outputs
 
-    def layers(self, run: int) -> list[tuple[Tensor, Tensor]]:
-        """Return (weight [in, out], bias [out]) of each layer of one run's first copy, on the CPU."""
-        parts = iter(torch.split(self.flat.detach()[0, run, : sum(self._splits)].cpu(), self._splits))
+    def layers(self, run: int, member: int = 0) -> list[tuple[Tensor, Tensor]]:
+        """Return (weight [in, out], bias [out]) of each layer of one network, on the CPU, for a policy file.
+
+        Raises:
+            OffbenchError: the network has LayerNorm, which a policy file cannot hold.
+        """
+        if self.norm != "none":
+            raise OffbenchError("a policy file cannot hold a network with LayerNorm")
+        widths = [n for i, o in self._shapes for n in (i * o, o)]
+        parts = iter(torch.split(self.flat.detach()[member, run, : sum(widths)].cpu(), widths))
         return [(next(parts).view(i, o).clone(), next(parts).clone()) for i, o in self._shapes]
 
 
 class Target:
-    """A slowly following copy of a network."""
+    """A copy of a network that follows it slowly."""
 
     def __init__(self, source: Network) -> None:
         self.source = source
         self.flat = source.flat.detach().clone()
 
     def __call__(self, *inputs: Tensor) -> Tensor:
-        """Return the copy's outputs [copies, runs, batch, out]."""
+        """Return the copy's outputs, with the axes of the network's."""
         return self.source.forward(self.flat, *inputs)
 
-    def follow(self, tau: float) -> None:
-        """Polyak: target <- (1 - tau) target + tau source."""
+    def polyak_update(self, tau: float) -> None:
+        """Set target = (1 - tau) target + tau network."""
         self.flat.lerp_(self.source.flat.detach(), tau)
 
     def tensors(self) -> dict[str, Tensor]:

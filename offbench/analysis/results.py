@@ -23,15 +23,14 @@ from offbench.common.errors import OffbenchError
 from offbench.common.scores import mean_std, normalize, run_return, window
 from offbench.common.text import counted, printable
 from offbench.data.levels import LEVELS
+from offbench.training.registry import FORMER_SETTINGS
 from offbench.training.run import DIGITS, Run, find_runs
 
 # the order of the BDB paper's Table 1; levels are in its order already
 ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
 METHOD_ORDER = ("td3_bc", "cql", "bdb")
 REFERENCES = {"dataset": "own reference", "d4rl": "D4RL's constants", None: "no reference: raw return"}
-# Settings that make BDB another method than the paper's (in algos/bdb.py their help begins with "ours").
-OURS = {"uncertainty", "uncertainty_scale", "beta_max", "cloning_steps", "beta_target", "beta_learning_rate"}
-OURS |= {"critic_penalty", "penalty_weight", "penalty_actions"}
+OURS = FORMER_SETTINGS["bdb"].keys()  # settings that make an earlier version's BDB another method than the paper's
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from offbench.training.batches import Member
 from offbench.training.devices import arithmetic, stack_size
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run
-from offbench.training.stack import WARM_UP, Stack
+from offbench.training.stack import RECORDED, Stack
 
 SECONDS = 0.5  # that a measurement lasts at least
 ROWS = 4096  # made-up transitions
@@ -51,7 +51,7 @@ def measure(
     with arithmetic(device, precision):
         runs = stack or (1 if device == "cpu" else stack_size(kind, member, device))
         learning = Stack(kind, [member] * runs, device)
-        wanted = 2 * WARM_UP + 2
+        wanted = 2 * RECORDED
         while True:
             began, first = time.perf_counter(), learning.step
             for _ in learning.train(first + wanted):
@@ -71,10 +71,10 @@ def operations(algorithm: str, config: Any, spec: str) -> float:
 
     learning = Stack(load_algorithm(algorithm), [made_up(algorithm, config, spec)], "cpu")
     learning.program.eager = True
-    for _ in learning.train(2 * WARM_UP):  # past whatever happens only once
+    for _ in learning.train(2 * RECORDED):  # past whatever happens only once
         pass
     with products_by("pytorch"), FlopCounterMode(display=False) as counter:
-        for _ in learning.train(2 * WARM_UP + COUNTED):
+        for _ in learning.train(2 * RECORDED + COUNTED):
             pass
     return float(counter.get_total_flops()) / COUNTED
 

@@ -143,7 +143,7 @@ def similarity(
     )
     noise = policy.draw(rng, samples) if policy.needs_noise(deterministic=True) else None
     pi = torch.from_numpy(policy.act(batch.observations[0].numpy(), noise)).unsqueeze(0)
-    q_pi, q_data = (critic.frozen(batch.observations, a, copies=1).flatten() for a in (pi, batch.actions))
+    q_pi, q_data = (critic.frozen(batch.observations, a, members=0).flatten() for a in (pi, batch.actions))
     distance = (pi - batch.actions).square().mean(-1).sqrt().flatten()
     found = {
         "step": stack.step,

@@ -9,7 +9,7 @@ in a stack, and a resume needs no generator state.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from offbench.algorithm.interface import Batch, Draw
+from offbench.algorithm.interface import NOT_LOADED, Batch, NoiseSpec
 from offbench.common import seeds
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import Purpose
@@ -45,7 +45,13 @@ class Member:
 class Store:
     """The transitions of all runs' datasets on the device, end to end, and where each run's begin."""
 
-    def __init__(self, members: Sequence[Member], normalize_observations: bool, device: torch.device) -> None:
+    def __init__(
+        self,
+        members: Sequence[Member],
+        normalize_observations: bool,
+        device: torch.device,
+        next_actions: bool = False,
+    ) -> None:
         distinct = {member.data.dataset_id: member.data for member in members}
         starts, count, row = {}, 0, 0
         parts: dict[str, list[Tensor]] = {k: [] for k in ("observations", "rows", "actions", "rewards", "masks")}
@@ -74,6 +80,12 @@ class Store:
         self.mean = torch.from_numpy(np.stack([mean for mean, _ in self.normalizers])).to(device).unsqueeze(1)
         self.std = torch.from_numpy(np.stack([std for _, std in self.normalizers])).to(device).unsqueeze(1)
         self.normalize = normalize_observations
+        self.following: Tensor | None = None  # the transition after each, or itself where the data has none
+        if next_actions:
+            follows = torch.zeros(count, dtype=torch.bool, device=device)
+            follows[:-1] = self.rows[1:] == self.rows[:-1] + 1  # the rows of two episodes have a gap
+            self.following = torch.arange(count, device=device) + follows
+            self.follows = follows.float()
 
     def batch(self, indices: Tensor) -> Batch:
         """Return the transitions at `indices` [runs, batch], each run's counted from its own first."""
@@ -87,12 +99,19 @@ class Store:
         if self.normalize:
             observations = (observations - self.mean) / self.std
             next_observations = (next_observations - self.mean) / self.std
+        next_actions = next_action_masks = NOT_LOADED
+        if self.following is not None:
+            next_action_masks = self.follows.index_select(0, flat).view(indices.shape)
+            chosen = self.actions.index_select(0, self.following.index_select(0, flat)).view(shape)
+            next_actions = chosen * next_action_masks.unsqueeze(-1)
         return Batch(
             observations,
             self.actions.index_select(0, flat).view(shape),
             self.rewards.index_select(0, flat).view(indices.shape),
             next_observations,
             self.masks.index_select(0, flat).view(indices.shape),
+            next_actions,
+            next_action_masks,
         )
 
 
@@ -107,21 +126,21 @@ def draw_chunk(
     run_seeds: Sequence[int],
     sizes: Sequence[int],
     batch_size: int,
-    draws: Mapping[str, Draw],
+    noise_spec: NoiseSpec,
     chunk: int,
     device: torch.device,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return a chunk's batch indices [CHUNK, runs, batch] and noise {name: [CHUNK, runs, *shape]}."""
-    indices, noise = [], {name: [] for name in draws}  # type: tuple[list[Tensor], dict[str, list[Tensor]]]
+    indices, noise = [], {name: [] for name in noise_spec}  # type: tuple[list[Tensor], dict[str, list[Tensor]]]
     for seed, size in zip(run_seeds, sizes, strict=True):
         generator = torch.Generator(device).manual_seed(seeds.integer(seed, Purpose.CHUNK, chunk))
         indices.append(torch.randint(size, (CHUNK, batch_size), generator=generator, device=device))
-        for name, draw in draws.items():
-            shape = (CHUNK, *draw.shape)
-            if draw.distribution == "normal":
+        for name, distribution in noise_spec.items():
+            shape = (CHUNK, *distribution.shape)
+            if distribution.name == "normal":
                 noise[name].append(torch.randn(shape, generator=generator, device=device))
-            elif draw.distribution == "uniform":
+            elif distribution.name == "uniform":
                 noise[name].append(torch.rand(shape, generator=generator, device=device) * 2 - 1)
             else:
-                raise OffbenchError(f"draws: {name!r} must be normal or uniform, not {draw.distribution!r}")
+                raise OffbenchError(f"noise_spec: {name!r} must be normal or uniform, not {distribution.name!r}")
     return torch.stack(indices, 1), {name: torch.stack(parts, 1) for name, parts in noise.items()}

@@ -9,7 +9,8 @@ import os
 import sys
 import traceback
 import types
-from typing import TYPE_CHECKING, cast
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, unknown
 from offbench.common.files import OPEN_FILES
@@ -21,6 +22,20 @@ GROUP = "offbench.algos"
 
 
 NEEDED = ("batch_size", "normalize")  # settings that the training itself reads
+# Settings of earlier versions, which bdb_plus has now, and the values under which a run trains as without them.
+FORMER_SETTINGS: dict[str, dict[str, Any]] = {
+    "bdb": {
+        "uncertainty": "absolute",
+        "uncertainty_scale": 1.0,
+        "beta_max": 1.0,
+        "cloning_steps": 0,
+        "beta_target": 0.05,
+        "beta_learning_rate": 3e-4,
+        "critic_penalty": "none",
+        "penalty_weight": 1.0,
+        "penalty_actions": 10,
+    }
+}
 
 
 @functools.cache
@@ -96,10 +111,36 @@ def load_algorithm(name: str) -> type[Algorithm]:
     except Exception as error:  # whatever its code raises
         why = f"{type(error).__name__}: {error}"
         raise OffbenchError(f"algorithm {name!r} ({point.value}) does not import: {why} ({SHOW_TRACEBACK})") from error
+    from offbench.algorithm.interface import Algorithm  # imports PyTorch, which those who ask for names do without
+
+    if not (isinstance(kind, type) and issubclass(kind, Algorithm)):
+        raise OffbenchError(
+            f"algorithm {name!r} ({point.value}) must be a subclass of offbench.algorithm.Algorithm; "
+            "see docs/extending.md"
+        )
     config = getattr(kind, "Config", None)
     if not (isinstance(config, type) and dataclasses.is_dataclass(config)):
         raise OffbenchError(f"algorithm {name!r} ({point.value}): Config must be a dataclass of settings")
     for needed in NEEDED:
         if needed not in {field.name for field in dataclasses.fields(config)}:
             raise OffbenchError(f"algorithm {name!r} ({point.value}): its Config lacks the setting {needed}")
-    return cast("type[Algorithm]", kind)
+    return kind
+
+
+def current_settings(algorithm: str, settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return a run's recorded settings without those that its algorithm had in an earlier version only.
+
+    Raises:
+        OffbenchError: one of them had an effect, so that the run can be reported but not resumed or restored.
+    """
+    former = FORMER_SETTINGS.get(algorithm, {})
+    used = {name: settings[name] for name, off in former.items() if settings.get(name, off) != off}
+    if algorithm == "bdb" and settings.get("beta") == "learned":
+        used["beta"] = "learned"
+    if used:
+        name, value = next(iter(used.items()))
+        raise OffbenchError(
+            f"{where} was trained by an earlier version of {algorithm} with {name} = {value!r}, which is a setting of "
+            "bdb_plus now; the run can still be reported and evaluated, but not resumed"
+        )
+    return {name: value for name, value in settings.items() if name not in former}

@@ -33,6 +33,7 @@ from offbench.common.files import (
     write_bytes,
     write_json,
 )
+from offbench.training.registry import current_settings
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 FORMAT = "offbench-run-1"
@@ -112,7 +113,10 @@ class Run:
         if self.config_path.exists():
             known = self.config()
             for key in MUST_MATCH:
-                if known.get(key) == config[key]:
+                before = known.get(key)
+                if key == "settings":
+                    before = current_settings(known["algorithm"], known["settings"], str(self.folder))
+                if before == config[key]:
                     continue
                 if key == "dataset_sha256":
                     raise OffbenchError(
@@ -120,7 +124,7 @@ class Run:
                         "recorded again since; delete that run or give another --runs"
                     )
                 raise OffbenchError(
-                    f"{self.folder} holds a run with {key} {known.get(key)!r}, not {config[key]!r}; "
+                    f"{self.folder} holds a run with {key} {before!r}, not {config[key]!r}; "
                     "delete it or give another --runs"
                 )
         elif any(self.folder.glob("checkpoint-*.safetensors")):

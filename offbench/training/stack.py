@@ -1,29 +1,29 @@
 """A stack: runs that learn as one program.
 
-Program   one update of every run, fed from buffers that stay in place: it is captured once for each kind of update and
-          then replayed, on a GPU as a CUDA graph, on a CPU by offbench.algorithm.capture
+Program   one update of every run, fed from buffers that stay in place: it is captured once for each phase and then
+          replayed, on a GPU as a CUDA graph, on a CPU by offbench.algorithm.capture
 Stack     the learning state of the runs: train, log, policies, what a checkpoint keeps
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from offbench.algorithm.capture import NotCapturableError, Recording, record
+from offbench.algorithm.capture import NotCapturableError, Recording, attributes, changed_attribute, record
 from offbench.algorithm.interface import Algorithm, PolicyParts, check_logs, stack_configs
-from offbench.algorithm.networks import Learned, Target
 from offbench.common.errors import OffbenchError
 from offbench.rollouts.policy import Policy, check_networks
 from offbench.training.batches import CHUNK, Member, Store, draw_chunk
 
 Sums = list[tuple[str, float, int]]  # of each logged quantity: its name, its sum, and over how many updates
-RECORD_EVERY = 1000  # updates of a kind between two records of it on a CPU
-WARM_UP = 3  # updates of a kind before it is captured: libraries allocate their workspaces in the first ones
+RECORDED = 6  # updates of a phase before a replay is trusted on a CPU: all but the first are recorded and compared
+RECORD_EVERY = 1000  # updates of a phase between two later records of it
+WARM_UP = 3  # updates of a phase before it is captured on a GPU: libraries allocate workspaces in the first ones
 
 
 class Program:
@@ -40,11 +40,11 @@ class Program:
         self.indices, self.noise = torch.empty(0), dict[str, Tensor]()
         self.sums: dict[str, Tensor] = {}
         self.counts: dict[str, int] = {}
-        self._names: dict[str, list[str]] = {}  # what each kind of update logs
-        self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
-        self._recordings: dict[str, Recording] = {}
-        self._done: dict[str, int] = {}
-        self.eager = not getattr(algorithm, "capture", True)  # whether every update runs as it is
+        self._names: dict[Hashable, list[str]] = {}  # what each phase logs
+        self._graphs: dict[Hashable, torch.cuda.CUDAGraph] = {}
+        self._recordings: dict[Hashable, Recording] = {}
+        self._done: dict[Hashable, int] = {}  # updates of each phase
+        self.eager = not algorithm.capture  # whether every update runs as it is
         self._side: Any = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
 
     def load(self, indices: Tensor, noise: Mapping[str, Tensor], first: int) -> None:
@@ -56,80 +56,90 @@ class Program:
             self.noise[name].copy_(values)
         self.position.fill_(first)
 
-    def run(self, kind: str) -> None:
+    def run(self, phase: Hashable) -> None:
         """Do the next update."""
-        if self._side is not None:
-            if kind in self._graphs:
-                self._graphs[kind].replay()
-            else:
-                self._first(kind, self._side)
-        elif self.eager:
-            self._update(kind)
+        if self.eager:
+            self._update(phase)
+        elif self._side is None:
+            self._captured(phase)
+        elif phase in self._graphs:
+            self._graphs[phase].replay()
         else:
-            self._captured(kind)
-        for name in self._names[kind]:
+            self._warm_up(phase, self._side)
+        for name in self._names[phase]:
             self.counts[name] = self.counts.get(name, 0) + 1
 
-    def _captured(self, kind: str) -> None:
-        """Do an update on the CPU: the first of a kind as it is, two recorded, the rest replayed.
+    def _captured(self, phase: Hashable) -> None:
+        """Do an update on the CPU: the first of a phase as it is, the next ones recorded, the rest replayed.
 
         Every RECORD_EVERY-th is recorded again, so that an update that changes later on is noticed.
         """
-        done = self._done[kind] = self._done.get(kind, 0) + 1
-        if done == 1:
-            self._update(kind)
-        elif done > 3 and done % RECORD_EVERY:
+        done = self._done[phase] = self._done.get(phase, 0) + 1
+        if done > RECORDED and done % RECORD_EVERY:
             with torch.inference_mode():
-                self._recordings[kind].replay()
-        else:
-            where = f"{type(self.algorithm).__name__}.update"
-            try:
-                recording = record(lambda: self._update(kind))
-            except NotCapturableError as error:
-                self._leave_eager(f"{where} cannot be captured ({error})")
-                return
-            if done > 2 and not recording.same_as(self._recordings[kind]):
-                if done > 3:
-                    raise OffbenchError(
-                        f"{where} changes with the number of updates; let `kind` tell apart what differs, or set "
-                        f"`capture = False` in class {type(self.algorithm).__name__}"
-                    )
-                self._leave_eager(f"{where} is not the same at every update of kind {kind!r}")
-            elif done <= 3:
-                self._recordings[kind] = recording
+                self._recordings[phase].replay()
+            return
+        before, recording = attributes(self.algorithm), None
+        try:
+            if done == 1:
+                self._update(phase)
+            else:
+                recording = record(lambda: self._update(phase))
+        except NotCapturableError as error:
+            self._leave_eager(f"cannot be captured ({error})")
+            return
+        changed = changed_attribute(before, attributes(self.algorithm), first=done == 1)
+        reason = f"changes the attribute {changed}" if changed else ""
+        if recording is not None:
+            if phase in self._recordings and not recording.same_as(self._recordings[phase]):
+                reason = reason or f"is not the same at every update of phase {phase!r}"
+            if done <= RECORDED:  # a later one is only compared: its buffers are not worth a change of place
+                self._recordings[phase] = recording
+        if reason and done > RECORDED:
+            name = type(self.algorithm).__name__
+            raise OffbenchError(
+                f"{name}.update {reason} after {done:,} updates; let `phase` tell apart what differs, or set "
+                f"`capture = False` in class {name}"
+            )
+        if reason:
+            self._leave_eager(reason)
 
     def _leave_eager(self, reason: str) -> None:
         self.eager = True
-        self._recordings = {}
-        print(f"offbench: {reason}: every update runs as it is, which is slower", file=sys.stderr)
+        self._recordings, self._graphs = {}, {}
+        name = type(self.algorithm).__name__
+        print(f"offbench: {name}.update {reason}: every update runs as it is, which is slower", file=sys.stderr)
 
-    def _first(self, kind: str, side: Any) -> None:
-        """Do one of the first updates of a kind as it is; after a few, capture the kind for those to come."""
+    def _warm_up(self, phase: Hashable, side: Any) -> None:
+        """Do one of the first updates of a phase as it is; after a few, capture the phase for those to come."""
+        done = self._done[phase] = self._done.get(phase, 0) + 1
+        before = attributes(self.algorithm)
         side.wait_stream(torch.cuda.current_stream(self.device))
         with torch.cuda.stream(side):
-            self._update(kind)
+            self._update(phase)
         torch.cuda.current_stream(self.device).wait_stream(side)
-        self._done[kind] = self._done.get(kind, 0) + 1
-        if self._done[kind] == WARM_UP:
+        if changed := changed_attribute(before, attributes(self.algorithm), first=done == 1):
+            self._leave_eager(f"changes the attribute {changed}")
+        elif done == WARM_UP:
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph, stream=side):  # recorded, not run
-                self._update(kind)
-            self._graphs[kind] = graph
+                self._update(phase)
+            self._graphs[phase] = graph
 
-    def _update(self, kind: str) -> None:
+    def _update(self, phase: Hashable) -> None:
         batch = self.store.batch(self.indices.index_select(0, self.position)[0])
         noise = {name: values.index_select(0, self.position)[0] for name, values in self.noise.items()}
-        logs = self.algorithm.update(batch, noise, kind)
-        if kind not in self._names:
-            check_logs(logs, len(self.store.sizes), f"{type(self.algorithm).__name__}.update")
-            self._names[kind] = list(logs)
-        elif self._names[kind] != list(logs):  # a captured graph would go on with those of the first update
-            where = f"{type(self.algorithm).__name__}.update"
-            raise OffbenchError(f"{where} must log the same names at every update of kind {kind!r}")
+        logs = self.algorithm.update(batch, noise, phase)
+        where = f"{type(self.algorithm).__name__}.update"
+        if phase not in self._names:
+            check_logs(logs, len(self.store.sizes), where)
+            self._names[phase] = list(logs)
+        elif self._names[phase] != list(logs):  # a replay would log those of the first update
+            raise OffbenchError(f"{where} must log the same names at every update of phase {phase!r}")
         for name, value in logs.items():
             if name not in self.sums:
-                self.sums[name] = torch.zeros_like(value)
-            self.sums[name] += value
+                self.sums[name] = torch.zeros_like(value, requires_grad=False)
+            self.sums[name] += value.detach()
         self.position += 1
 
     def logged(self) -> dict[str, list[float]]:
@@ -164,9 +174,11 @@ class Stack:
         observation_dim, action_dim = dims.pop()
         self.algorithm = kind(config, observation_dim, action_dim, self.seeds, self.device)
         _check_policy(self.algorithm, observation_dim, action_dim)
-        _check_learned(self.algorithm)
+        if not self.algorithm.learned:
+            raise OffbenchError(f"{kind.__name__} has no networks among its attributes: a checkpoint would be empty")
         self.batch_size: int = config.batch_size
-        self.store = Store(members, config.normalize, self.device)
+        self.store = Store(members, config.normalize, self.device, self.algorithm.uses_next_actions)
+        self.noise_spec = self.algorithm.noise_spec(self.algorithm.config)
         self.program = Program(self.algorithm, self.store)
         self.step = 0
 
@@ -174,10 +186,10 @@ class Stack:
         """Update up to step `until`; yields the step after every chunk (and at the end)."""
         while self.step < until:
             chunk, first = divmod(self.step, CHUNK)
-            drawn = draw_chunk(self.seeds, self.store.sizes, self.batch_size, self.algorithm.draws, chunk, self.device)
+            drawn = draw_chunk(self.seeds, self.store.sizes, self.batch_size, self.noise_spec, chunk, self.device)
             self.program.load(*drawn, first)
             for _ in range(first, min(CHUNK, first + until - self.step)):
-                self.program.run(self.algorithm.kind(self.step))
+                self.program.run(self.algorithm.phase(self.step))
                 self.step += 1
             yield self.step
 
@@ -242,16 +254,6 @@ class Stack:
                 bad = (~torch.isfinite(tensor)).flatten(2).any(2).any(0).nonzero()
                 found |= {int(run): name for run in bad}
         return found
-
-
-def _check_learned(algorithm: Algorithm) -> None:
-    """Raise OffbenchError if a checkpoint would lack a network: a run that resumes would go on with another one."""
-    where, kept = f"{type(algorithm).__name__}.learned", list(algorithm.learned.values())
-    if not kept:
-        raise OffbenchError(f"{where} is empty: a checkpoint would keep nothing")
-    for name, part in vars(algorithm).items():
-        if isinstance(part, Learned | Target) and not any(part is one for one in kept):
-            raise OffbenchError(f"{where} lacks {name}: a run that resumes would go on with another one")
 
 
 def _check_policy(algorithm: Algorithm, observation_dim: int, action_dim: int) -> None:

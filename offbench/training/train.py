@@ -20,7 +20,7 @@ from offbench.training.devices import check_precision, pick_device
 from offbench.training.grouping import Part, cut, diverged, pending, with_evaluators
 from offbench.training.jobs import Job, Order, complain, run_jobs
 from offbench.training.loggers import Destinations
-from offbench.training.registry import load_algorithm
+from offbench.training.registry import current_settings, load_algorithm
 from offbench.training.run import Run, run_folder, settings_dict, variant
 from offbench.training.stack import Stack
 from offbench.training.trainer import Schedule
@@ -167,7 +167,8 @@ def restore(run: Run) -> Stack:
     """
     config = run.config()
     kind = load_algorithm(config["algorithm"])
-    settings: Any = build(kind.Config, config["settings"], f"{run.config_path}: settings")
+    recorded = current_settings(config["algorithm"], config["settings"], str(run.folder))
+    settings: Any = build(kind.Config, recorded, f"{run.config_path}: settings")
     data = transitions.load(config["dataset"])
     if data.content != config["dataset_sha256"]:
         raise OffbenchError(f"{data.dataset_id} is no longer the dataset that {run.folder} was trained on")

@@ -60,7 +60,7 @@ def test_similar_score_by_hand(medium: str) -> None:
     mean, std = data.normalizer()
     inputs = torch.from_numpy((states - mean) / std).unsqueeze(0)
     critic: Any = stack.algorithm.learned["critic"]
-    q_pi, q = (critic(inputs, torch.from_numpy(a).unsqueeze(0))[0, 0, :, 0].detach().numpy() for a in (pi, actions))
+    q_pi, q = (critic(inputs, torch.from_numpy(a).unsqueeze(0))[0, 0].detach().numpy() for a in (pi, actions))
     assert found["q_similar"] == pytest.approx(100 * np.mean(np.abs(q_pi - q) <= 0.02 * np.abs(q)), abs=0.3)
     distance = np.sqrt(((pi - actions) ** 2).mean(1))
     assert found["action_similar"] == pytest.approx(100 * np.mean(distance <= 0.3), abs=0.3)

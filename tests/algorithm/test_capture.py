@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from offbench.algorithm import Algorithm, Batch, Logs, Noise
 from offbench.algorithm.capture import NotCapturableError, record
-from offbench.algorithm.interface import Batch, Draw, PolicyParts
-from offbench.algorithm.networks import Network
 from offbench.benchmarks.throughput import made_up
 from offbench.common.errors import OffbenchError
 from offbench.common.settings import build, setting
@@ -40,8 +39,8 @@ CASES: list[tuple[str, dict[str, str]]] = [
     ("bc", {}),
     ("td3_bc", {}),
     ("bdb", {}),
-    ("bdb", {"beta": "learned", "critic_penalty": "cql", "cloning_steps": "20"}),
-    ("bdb", {"critics": "3", "beta_scope": "batch", "uncertainty": "relative"}),
+    ("bdb_plus", {"beta": "learned", "critic_penalty": "cql", "cloning_steps": "20"}),
+    ("bdb_plus", {"critics": "3", "beta_scope": "batch", "uncertainty": "relative"}),
     ("cql", {"bc_steps": "20", "num_actions": "3"}),
     ("cql", {"bc_steps": "0", "lagrange": "true", "num_actions": "3"}),
 ]
@@ -70,34 +69,20 @@ class Config:
     normalize: bool = setting(False, "normalise")
 
 
-class Plain:
+class Plain(Algorithm[Config]):
     """Behaviour cloning whose loss tests replace."""
 
-    Config = Config
-
-    def __init__(self, config: Any, observation_dim: int, action_dim: int, run_seeds: Any, device: Any) -> None:
-        self.actor = Network((observation_dim, 8, action_dim), run_seeds, 0, learning_rate=1e-2, device=device)
-        self.learned = {"actor": self.actor}
-        self.updates = 0
-
-    @property
-    def draws(self) -> dict[str, Draw]:
-        return {}
-
-    def kind(self, step: int) -> str:
-        return "cloning"
+    def setup(self, c: Config) -> None:
+        self.actor = self.actor_network(self.action_dim, 1e-2, hidden=(8,))
+        self.updates, self.history, self.limits = 0, [0.5], {"low": [1.0]}
 
     def loss(self, error: Tensor) -> Tensor:
         return error.square().mean((-1, -2))
 
-    def update(self, batch: Batch, noise: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
-        self.updates += 1
-        loss = self.loss(self.actor(batch.observations)[0].tanh() - batch.actions)
-        self.actor.minimize(loss.sum())
-        return {"bc": loss.detach()}
-
-    def policy(self, run: int) -> PolicyParts:
-        return PolicyParts("tanh", self.actor.layers(run))
+    def update(self, batch: Batch, noise: Noise, phase: None) -> Logs:
+        loss = self.loss(self.actor(batch.observations).tanh() - batch.actions)
+        self.actor.minimize(loss)
+        return {"bc": loss}
 
 
 class Random(Plain):
@@ -113,12 +98,72 @@ class ReadsNumbers(Plain):
 
 class Counts(Plain):
     def loss(self, error: Tensor) -> Tensor:
+        self.updates += 1
         return super().loss(error) / self.updates
 
 
-class Changes(Plain):
+class EveryFifth(Plain):
+    """Its counter is out of sight of any look at attributes."""
+
+    def setup(self, c: Config) -> None:
+        super().setup(c)
+        count = itertools.count(1)
+        self.fifth = lambda: next(count) % 5 == 0
+
     def loss(self, error: Tensor) -> Tensor:
-        return super().loss(error) * (1.0 if self.updates < 5 else 0.5)
+        return super().loss(error) * (0.5 if self.fifth() else 1.0)
+
+
+class EveryFifthByAttribute(Plain):
+    def loss(self, error: Tensor) -> Tensor:
+        self.updates += 1
+        return super().loss(error) * (1.0 if self.updates % 5 else 0.5)
+
+
+class GrowsAList(Plain):
+    """It reads the list much later than it is changed."""
+
+    def loss(self, error: Tensor) -> Tensor:
+        self.history.append(0.5)
+        return super().loss(error) * (1.0 if len(self.history) < 30 else 0.5)
+
+
+class ChangesAListInADict(Plain):
+    def loss(self, error: Tensor) -> Tensor:
+        self.limits["low"][0] *= 0.99
+        return super().loss(error) * self.limits["low"][0]
+
+
+class ChangesConfig(Plain):
+    def loss(self, error: Tensor) -> Tensor:
+        self.config.learning_rate *= 0.99
+        return super().loss(error) * self.config.learning_rate
+
+
+class ReplacesATensor(Plain):
+    """A running mean that is a new tensor at every update."""
+
+    def setup(self, c: Config) -> None:
+        super().setup(c)
+        self.mean = torch.ones(len(self.run_seeds))
+
+    def loss(self, error: Tensor) -> Tensor:
+        loss = super().loss(error)
+        self.mean = 0.9 * self.mean + 0.1 * loss.detach()
+        return loss / self.mean
+
+
+class CountsInAPhase(Plain):
+    """A counter that moves in a phase that comes at every tenth update alone, and is read in the other."""
+
+    def phase(self, step: int) -> bool:
+        return step % 10 == 9
+
+    def update(self, batch: Batch, noise: Noise, phase: bool) -> Logs:
+        self.updates += phase
+        loss = self.loss(self.actor(batch.observations).tanh() - batch.actions) / (1 + self.updates)
+        self.actor.minimize(loss)
+        return {"bc": loss}
 
 
 class Converts(Plain):
@@ -128,13 +173,36 @@ class Converts(Plain):
         return super().loss(error) * torch.tensor([0.5, 2.0])[1]
 
 
-@pytest.mark.parametrize("kind", [Random, ReadsNumbers, Counts])
+class ChangesInPlace(Plain):
+    """A running mean that stays in its tensor is replayed too, and one made at the first update."""
+
+    factor: Tensor | None = None
+
+    def setup(self, c: Config) -> None:
+        super().setup(c)
+        self.mean = torch.ones(len(self.run_seeds))
+
+    def loss(self, error: Tensor) -> Tensor:
+        if self.factor is None:
+            self.factor = torch.full((1,), 0.9)
+        loss = super().loss(error)
+        self.mean.mul_(self.factor).add_(0.1 * loss.detach())
+        return loss / self.mean
+
+
+EAGER = [Random, ReadsNumbers, Counts, EveryFifth, EveryFifthByAttribute, GrowsAList, ChangesAListInADict]
+EAGER += [ChangesConfig, ReplacesATensor, CountsInAPhase]
+
+
+@pytest.mark.parametrize("kind", EAGER)
 def test_what_cannot_be_replayed_runs_as_it_is_and_says_so(kind: type, capsys: pytest.CaptureFixture[str]) -> None:
     torch.manual_seed(0)
     ours = stack_of(kind)
     found = trained(ours, 50)
     assert ours.program.eager
-    assert f"{kind.__name__}.update" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"{kind.__name__}.update" in said
     torch.manual_seed(0)
     eager = stack_of(kind)
     eager.program.eager = True
@@ -142,8 +210,9 @@ def test_what_cannot_be_replayed_runs_as_it_is_and_says_so(kind: type, capsys: p
     assert all(torch.equal(found[0][name], wanted[0][name]) for name in wanted[0])
 
 
-def test_a_constant_made_anew_is_replayed(capsys: pytest.CaptureFixture[str]) -> None:
-    ours, eager = stack_of(Converts), stack_of(Converts)
+@pytest.mark.parametrize("kind", [Plain, Converts, ChangesInPlace])
+def test_what_does_the_same_at_every_update_is_replayed(kind: type, capsys: pytest.CaptureFixture[str]) -> None:
+    ours, eager = stack_of(kind), stack_of(kind)
     eager.program.eager = True
     assert torch.equal(trained(ours, 50)[0]["actor.flat"], trained(eager, 50)[0]["actor.flat"])
     assert not ours.program.eager
@@ -153,16 +222,21 @@ def test_a_constant_made_anew_is_replayed(capsys: pytest.CaptureFixture[str]) ->
 def test_an_update_that_changes_later_on_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stack_module, "RECORD_EVERY", 20)
 
-    class Later(Changes):
-        def update(self, batch: Batch, noise: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
-            return super().update(batch, noise, kind)
+    class Later(Plain):
+        def setup(self, c: Config) -> None:
+            super().setup(c)
+            count = itertools.count()
+            self.early = lambda: next(count) < stack_module.RECORDED
 
-    with pytest.raises(OffbenchError, match=r"Later\.update changes with the number of updates.*capture = False"):
+        def loss(self, error: Tensor) -> Tensor:
+            return super().loss(error) * (1.0 if self.early() else 0.5)
+
+    with pytest.raises(OffbenchError, match=r"Later\.update is not the same at every update.*capture = False"):
         trained(stack_of(Later), 100)
-    Later.capture = False  # type: ignore[attr-defined]
+    Later.capture = False
     ours = stack_of(Later)
     trained(ours, 100)
-    assert ours.algorithm.updates == 100  # type: ignore[attr-defined]
+    assert not ours.program._recordings
 
 
 def test_a_record_is_done_as_well() -> None:

@@ -13,7 +13,7 @@ from torch.distributions import Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 
 from offbench.algorithm.interface import Batch, stack_configs
-from offbench.algos.cql import CQL, Config, actor_loss, at_each, conservative_penalty, critic_loss, log_prob, sample
+from offbench.algos.cql import CQL, Config, log_prob, q_of_actions, sample
 from offbench.rollouts.policy import Policy, from_bytes
 
 OBS, ACT, BATCH = 3, 2, 64
@@ -27,9 +27,9 @@ def make(act: int = ACT, batch: int = BATCH, **settings: Any) -> CQL:
 def noise_for(algorithm: CQL, seed: int = 0) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(seed)
     found = {}
-    for name, draw in algorithm.draws.items():
-        shape = (1, *draw.shape)
-        normal = draw.distribution == "normal"
+    for name, distribution in algorithm.noise_spec(algorithm.config).items():
+        shape = (1, *distribution.shape)
+        normal = distribution.name == "normal"
         found[name] = (
             torch.randn(shape, generator=generator) if normal else torch.rand(shape, generator=generator) * 2 - 1
         )
@@ -65,8 +65,8 @@ def test_importance_weights_estimate_the_integral_over_actions() -> None:
     observations = batch.observations[:, :, None].expand(1, 4, len(grid), OBS).reshape(1, -1, OBS)
     q = algorithm.critic.frozen(observations, grid.repeat(4).view(1, -1, 1)).view(2, 4, len(grid)).double()
     integral = torch.trapezoid(q.exp(), grid.double(), dim=-1).log()  # [critics, batch]
-    data = algorithm.critic.frozen(batch.observations, batch.actions).squeeze(-1)
-    penalty = conservative_penalty(algorithm.critic, algorithm.actor, batch, noise, data)
+    data = algorithm.critic.frozen(batch.observations, batch.actions)
+    penalty = algorithm.conservative_penalty(batch, noise, data)
     expected = integral.mean(-1) + math.log(3 * 4000) - data[:, 0].mean(-1)
     torch.testing.assert_close(penalty[:, 0].double(), expected.double(), atol=0.02, rtol=0)
 
@@ -75,7 +75,7 @@ def test_uniform_actions_cover_both_signs() -> None:
     from offbench.training.batches import CHUNK, draw_chunk
 
     algorithm = make()
-    _, noise = draw_chunk([0], [50], BATCH, algorithm.draws, 0, torch.device("cpu"))
+    _, noise = draw_chunk([0], [50], BATCH, algorithm.noise_spec(algorithm.config), 0, torch.device("cpu"))
     uniform = noise["uniform"]
     assert uniform.shape == (CHUNK, 1, 10, BATCH, ACT)
     assert uniform.min() < -0.99
@@ -91,14 +91,14 @@ def test_the_warm_up_maximises_the_datas_likelihood() -> None:
     batch = batch._replace(actions=data)
     before = _likelihood(algorithm, batch)
     for step in range(300):
-        algorithm.update(batch, noise_for(algorithm, step), algorithm.kind(step))
+        algorithm.update(batch, noise_for(algorithm, step), algorithm.phase(step))
     assert _likelihood(algorithm, batch) > before + 1
-    mean = algorithm.actor(batch.observations)[0].chunk(2, -1)[0].tanh()
+    mean = algorithm.actor(batch.observations).chunk(2, -1)[0].tanh()
     assert (mean - 0.7).abs().mean() < 0.1
 
 
 def _likelihood(algorithm: CQL, batch: Batch) -> float:
-    mean, log_std = algorithm.actor(batch.observations)[0].chunk(2, -1)
+    mean, log_std = algorithm.actor(batch.observations).chunk(2, -1)
     return log_prob(mean, log_std, batch.actions.atanh()).mean().item()
 
 
@@ -113,14 +113,12 @@ def test_data_at_the_bounds_stays_finite() -> None:
 
 def test_the_warm_up_ends() -> None:
     algorithm = make(bc_steps=3)
-    assert [algorithm.kind(step) for step in range(5)] == ["cloning"] * 3 + ["sac"] * 2
+    assert [algorithm.phase(step) for step in range(5)] == [True] * 3 + [False] * 2
 
 
 def test_the_actor_step_gives_the_critics_no_gradient() -> None:
     algorithm = make()
-    loss, _ = actor_loss(
-        algorithm.actor, algorithm.critic, torch.ones(1), a_batch(), noise_for(algorithm)["actor"], False
-    )
+    loss = algorithm.actor_loss(a_batch(), noise_for(algorithm)["actor"], torch.ones(1), False)["actor_loss"]
     (to_critic,) = torch.autograd.grad(loss.sum(), [algorithm.critic.flat], retain_graph=True, allow_unused=True)
     (to_actor,) = torch.autograd.grad(loss.sum(), [algorithm.actor.flat])
     assert to_critic is None
@@ -129,15 +127,7 @@ def test_the_actor_step_gives_the_critics_no_gradient() -> None:
 
 def test_the_critic_step_gives_the_actor_no_gradient() -> None:
     algorithm = make()
-    loss, _ = critic_loss(
-        algorithm.critic,
-        algorithm.critic_target,
-        algorithm.actor,
-        None,
-        a_batch(),
-        noise_for(algorithm),
-        algorithm.config,
-    )
+    loss, _ = algorithm.critic_loss(a_batch(), noise_for(algorithm), torch.ones(1), algorithm.config)
     (to_actor,) = torch.autograd.grad(loss.sum(), [algorithm.actor.flat], allow_unused=True)
     assert to_actor is None
 
@@ -148,13 +138,11 @@ def test_no_entropy_in_the_target() -> None:
     noise = noise_for(algorithm)
     with torch.no_grad():
         actions, _ = sample(algorithm.actor, batch.next_observations, noise["target"])
-        q = algorithm.critic.frozen(batch.next_observations, actions[:, 0]).squeeze(-1)
+        q = algorithm.critic.frozen(batch.next_observations, actions[:, 0])
         y = batch.rewards + 0.99 * torch.minimum(q[0], q[1])
-        now = algorithm.critic.frozen(batch.observations, batch.actions).squeeze(-1)
+        now = algorithm.critic.frozen(batch.observations, batch.actions)
         expected = ((now[0] - y) ** 2).mean() + ((now[1] - y) ** 2).mean()
-    loss, _ = critic_loss(
-        algorithm.critic, algorithm.critic_target, algorithm.actor, None, batch, noise, algorithm.config
-    )
+    loss, _ = algorithm.critic_loss(batch, noise, torch.ones(1), algorithm.config)
     torch.testing.assert_close(loss[0], expected)
 
 
@@ -162,7 +150,7 @@ def test_the_temperature_moves_towards_the_target_entropy() -> None:
     """Entropy above the target (log pi below dim A): the temperature falls."""
     algorithm = make(actor_learning_rate=1e-3, bc_steps=0)
     for step in range(50):
-        logs = algorithm.update(a_batch(seed=step), noise_for(algorithm, step), "sac")
+        logs = algorithm.update(a_batch(seed=step), noise_for(algorithm, step), False)
     assert logs["log_pi"].item() < ACT
     assert logs["temperature"].item() < 1
 
@@ -173,9 +161,9 @@ def test_runs_in_a_stack_equal_runs_alone() -> None:
         algorithm = CQL(stack_configs(configs, "cpu"), OBS, ACT, seeds, "cpu")
         for step in range(200):
             batch, noise = a_batch(seed=step), noise_for(algorithm, step)
-            batch = Batch(*(x.expand(len(seeds), *x.shape[1:]).contiguous() for x in batch))
+            batch = Batch(*(x.expand(len(seeds), *x.shape[1:]).contiguous() for x in batch[:5]))
             many = {k: x.expand(len(seeds), *x.shape[1:]).contiguous() for k, x in noise.items()}
-            algorithm.update(batch, many, algorithm.kind(step))
+            algorithm.update(batch, many, algorithm.phase(step))
         return algorithm
 
     stack = train([1, 2, 3], [10.0, 1.0, 5.0])
@@ -190,7 +178,7 @@ def test_runs_in_a_stack_equal_runs_alone() -> None:
 def test_the_penalty_keeps_q_off_the_data_below(alpha: float) -> None:
     algorithm = make(alpha=alpha, bc_steps=0, critic_learning_rate=3e-3)
     for step in range(300):
-        algorithm.update(a_batch(), noise_for(algorithm, step), "sac")
+        algorithm.update(a_batch(), noise_for(algorithm, step), False)
     batch = a_batch()
     data = algorithm.critic.frozen(batch.observations, batch.actions).mean()
     elsewhere = algorithm.critic.frozen(batch.observations, noise_for(algorithm)["uniform"][:, 0]).mean()
@@ -202,7 +190,7 @@ def test_the_penalty_keeps_q_off_the_data_below(alpha: float) -> None:
 def test_the_lagrange_multiplier_holds_the_penalty_at_its_target(gap: float, rises: bool) -> None:
     algorithm = make(lagrange=True, target_action_gap=gap, critic_learning_rate=3e-3, bc_steps=0)
     for step in range(60):
-        logs = algorithm.update(a_batch(seed=step), noise_for(algorithm, step), "sac")
+        logs = algorithm.update(a_batch(seed=step), noise_for(algorithm, step), False)
     assert (logs["multiplier"].item() > 1.05) if rises else (logs["multiplier"].item() < 0.95)
 
 
@@ -210,9 +198,9 @@ def test_the_lagrange_form_by_hand() -> None:
     """td + multiplier (alpha penalty - gap), both critics, against the plain form's parts."""
     algorithm, batch = make(alpha=3.0, target_action_gap=0.7), a_batch()
     noise = noise_for(algorithm)
-    parts = algorithm.critic, algorithm.critic_target, algorithm.actor
-    plain, logs = critic_loss(*parts, None, batch, noise, algorithm.config)
-    held, _ = critic_loss(*parts, torch.tensor([2.5]), batch, noise, algorithm.config)
+    plain, logs = algorithm.critic_loss(batch, noise, torch.ones(1), algorithm.config)
+    algorithm.config.lagrange = True
+    held, _ = algorithm.critic_loss(batch, noise, torch.tensor([2.5]), algorithm.config)
     torch.testing.assert_close(held, logs["critic_loss"] + 2.5 * (logs["penalty"] - 1.4))
     torch.testing.assert_close(plain, logs["critic_loss"] + logs["penalty"])
 
@@ -233,6 +221,6 @@ def test_best_by_q_takes_the_sample_that_q1_likes_most() -> None:
     assert noise.shape == (32, 6, ACT)
     observations = a_batch(batch=32).observations
     actions, _ = sample(algorithm.actor, observations, torch.from_numpy(noise).float().transpose(0, 1).unsqueeze(0))
-    q = at_each(algorithm.critic, observations, actions)[0, 0]  # [samples, batch]
+    q = q_of_actions(algorithm.critic, observations, actions)[0, 0]  # [samples, batch]
     expected = actions[0, q.argmax(0), torch.arange(32)]
     np.testing.assert_allclose(policy.act(observations[0].numpy(), noise), expected.detach().numpy(), atol=1e-5)

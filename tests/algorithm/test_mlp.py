@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from offbench.algorithm.mlp import perceptrons, products_by, stacked
+from offbench.algorithm.mlp import perceptrons, products_by
+from offbench.algorithm.stacked import stacked
 
 ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
 SHAPES = [((5, 7, 6, 2), 11), ((14, 128, 96, 1), 128), ((3, 4), 1)]  # the last has no hidden layer

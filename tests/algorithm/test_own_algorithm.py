@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 import torch
 
-from offbench.algorithm import Draw, PolicyParts
+from offbench.algorithm import Algorithm, Network, PolicyParts
+from offbench.algorithm.interface import Distribution
 from offbench.common.errors import OffbenchError
 from offbench.training import registry
 from offbench.training.registry import load_algorithm
@@ -27,8 +28,11 @@ def own(**parts: Any) -> type:
 COUNT = itertools.count()
 
 
-def acting(algorithm: Any) -> PolicyParts:
-    return PolicyParts("tanh", algorithm.actor.layers(0))
+def elsewhere(self: Any, run: int) -> PolicyParts:
+    """A policy whose network is not kept."""
+    return PolicyParts(
+        "tanh", Network(self.observation_dim, (8,), self.action_dim, [0], 0, learning_rate=1.0).layers(0)
+    )
 
 
 OWN: dict[str, tuple[type, str]] = {
@@ -41,7 +45,6 @@ OWN: dict[str, tuple[type, str]] = {
         "'q' must be a tensor [runs] = [2], got one []",
     ),
     "not reduced": (own(update=lambda self: {"q": torch.zeros(2, 8)}), "[runs] = [2], got one [2, 8]"),
-    "a graph": (own(update=lambda self: {"q": self.actor.flat.sum((0, 2))}), "log 'q' must be detached"),
     "no logs": (own(update=lambda self: None), "AWAC.update must return a dict of logs, not a NoneType"),
     "a kind": (
         own(policy=lambda self: PolicyParts("gaussian", self.actor.layers(0))),
@@ -62,24 +65,31 @@ OWN: dict[str, tuple[type, str]] = {
         "layers must be detached",
     ),
     "a distribution": (
-        type("AWAC", (load_algorithm("td3_bc"),), {"draws": property(lambda self: {"target": Draw((8, 1), "beta")})}),
-        "draws: 'target' must be normal or uniform, not 'beta'",
+        type(
+            "AWAC",
+            (load_algorithm("td3_bc"),),
+            {"noise_spec": lambda self, c: {"target": Distribution((8, 1), "beta")}},
+        ),
+        "noise_spec: 'target' must be normal or uniform, not 'beta'",
     ),
     "nothing learned": (
-        own(policy=lambda self: setattr(self, "learned", {}) or acting(self)),
-        "AWAC.learned is empty",
-    ),
-    "a network forgotten": (
-        own(policy=lambda self: self.learned.pop("actor") and acting(self)),
-        "AWAC.learned lacks actor: a run that resumes would go on with another one",
+        type("AWAC", (load_algorithm("td3_bc"),), {"setup": lambda self, c: None, "policy": elsewhere}),
+        "AWAC has no networks among its attributes",
     ),
     "other logs": (
         own(update=lambda self: {f"loss {next(COUNT)}": torch.zeros(2)}),
-        "AWAC.update must log the same names at every update of kind",
+        "AWAC.update must log the same names at every update of phase",
     ),
-    "no Config": (type("AWAC", (), {"Config": None}), "algorithm 'awac' (awac:AWAC): Config must be a dataclass"),
+    "no base class": (
+        type("AWAC", (), {}),
+        "algorithm 'awac' (awac:AWAC) must be a subclass of offbench.algorithm.Algorithm",
+    ),
+    "no Config": (
+        type("AWAC", (Algorithm,), {"Config": None}),
+        "algorithm 'awac' (awac:AWAC): Config must be a dataclass",
+    ),
     "no batch_size": (
-        type("AWAC", (), {"Config": dataclasses.make_dataclass("Config", ["normalize"])}),
+        type("AWAC", (Algorithm,), {"Config": dataclasses.make_dataclass("Config", ["normalize"])}),
         "algorithm 'awac' (awac:AWAC): its Config lacks the setting batch_size",
     ),
     "no parts": (own(policy=lambda self: self.actor.layers(0)), "AWAC.policy must return PolicyParts, not a list"),

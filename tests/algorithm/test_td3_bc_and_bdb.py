@@ -36,41 +36,41 @@ def batches(count: int, runs: int = 1, seed: int = 0) -> Iterator[tuple[Batch, d
         yield batch, {"target": normal(BATCH, ACT)}
 
 
+def updated(algorithm: Algorithm, batch: Batch, noise: dict[str, Tensor], phase: Any) -> dict[str, Tensor]:
+    """Do an update, and return what it logs."""
+    return {name: value.detach() for name, value in algorithm.update(batch, noise, phase).items()}
+
+
 def run(algorithm: Algorithm, count: int, runs: int = 1, seed: int = 0) -> list[dict[str, Tensor]]:
     logs = []
     for step, (batch, noise) in enumerate(batches(count, runs, seed)):
-        logs.append(algorithm.update(batch, noise, algorithm.kind(step)))
+        logs.append(updated(algorithm, batch, noise, algorithm.phase(step)))
     return logs
 
 
 def reference_for(algorithm: Any, beta: Any = None) -> Reference:
-    critics = []
-    for copy in range(algorithm.critic.copies):
-        whole = algorithm.critic.flat
-        algorithm.critic.flat = whole[copy : copy + 1]
-        critics.append(algorithm.critic.layers(0))
-        algorithm.critic.flat = whole
+    critics = [algorithm.critic.layers(0, member) for member in range(algorithm.critic.ensemble_size)]
     discriminator = algorithm.discriminator.layers(0) if beta is not None else None
     return Reference(algorithm.actor.layers(0), critics, discriminator, beta)
 
 
 def follow(reference: Reference, count: int) -> None:
     for batch, noise in batches(count):
-        s, a, r, s2, masks = (x[0].double() for x in batch)
+        s, a, r, s2, masks = (x[0].double() for x in batch[:5])
         reference.update(s, a, r, s2, 1 - masks, noise["target"][0].double())
 
 
 def check_equal(algorithm: Any, reference: Reference, atol: float = 1e-5) -> None:
     check_network(algorithm.actor, reference.actor, atol)
     check_network(algorithm.actor_target, reference.actor_target, atol)
-    for copy, (critic, target) in enumerate(zip(reference.critics, reference.critic_targets, strict=True)):
-        check_network(algorithm.critic, critic, atol, copy)
-        check_network(algorithm.critic_target, target, atol, copy)
+    for member, (critic, target) in enumerate(zip(reference.critics, reference.critic_targets, strict=True)):
+        check_network(algorithm.critic, critic, atol, member)
+        check_network(algorithm.critic_target, target, atol, member)
 
 
-def check_network(ours: Any, theirs: torch.nn.Module, atol: float = 1e-5, copy: int = 0) -> None:
+def check_network(ours: Any, theirs: torch.nn.Module, atol: float = 1e-5, member: int = 0) -> None:
     expected = flat(theirs)
-    found, behind = ours.flat[copy, 0].double().split([len(expected), ours.flat.shape[-1] - len(expected)])
+    found, behind = ours.flat[member, 0].double().split([len(expected), ours.flat.shape[-1] - len(expected)])
     torch.testing.assert_close(found, expected, atol=atol, rtol=0)
     assert not behind.any()  # nothing moves what is there for alignment alone
 
@@ -113,10 +113,10 @@ def test_the_policy_and_targets_wait_for_every_second_update() -> None:
     algorithm = make("td3_bc", [{}])
     before = {name: part.tensors()["flat"].clone() for name, part in algorithm.learned.items()}
     (first, second) = list(batches(2))
-    algorithm.update(*first, algorithm.kind(0))
+    algorithm.update(*first, algorithm.phase(0))
     moved = {n for n, part in algorithm.learned.items() if not torch.equal(part.tensors()["flat"], before[n])}
     assert moved == {"critic"}
-    algorithm.update(*second, algorithm.kind(1))
+    algorithm.update(*second, algorithm.phase(1))
     moved = {n for n, part in algorithm.learned.items() if not torch.equal(part.tensors()["flat"], before[n])}
     assert moved == {"critic", "actor", "actor_target", "critic_target"}
 
@@ -129,7 +129,7 @@ def test_a_termination_cuts_the_bootstrap() -> None:
         for shift in (0.0, 3.0):
             algorithm = make("td3_bc", [{}])
             moved = batch._replace(masks=masks, next_observations=batch.next_observations + shift)
-            losses.append(algorithm.update(moved, noise, "critic")["critic_loss"].item())
+            losses.append(updated(algorithm, moved, noise, False)["critic_loss"].item())
         assert (losses[0] == losses[1]) == same
 
 
@@ -161,14 +161,12 @@ def test_runs_in_a_stack_equal_runs_alone() -> None:
 def test_the_discriminator_tells_data_from_policy_where_it_can() -> None:
     """Data actions at +0.8, the policy near 0: separable. The same with the policy's own actions: chance."""
     separable, hopeless = make("bdb", [{"beta": 0.5}]), make("bdb", [{"beta": 0.5}])
-    from offbench.algos.bdb import discriminator_loss  # the one loss alone, so that the policy stands still
-
     for algorithm, apart in ((separable, True), (hopeless, False)):
         for batch, _ in batches(400):
-            pi = algorithm.actor(batch.observations)[0].tanh().detach()
+            pi = algorithm.actor(batch.observations).tanh().detach()
             batch = batch._replace(actions=torch.full_like(pi, 0.8) if apart else pi)
-            loss, logs = discriminator_loss(algorithm.discriminator, pi, batch)
-            algorithm.discriminator.minimize(10 * loss.sum())
+            logs = algorithm.discriminator_loss(batch, pi)  # the one loss alone, so that the policy stands still
+            algorithm.discriminator.minimize(10 * logs["discriminator_loss"])
         if apart:
             assert logs["d_real"].item() > 0.9
             assert logs["d_fake"].item() < 0.1
@@ -189,23 +187,20 @@ def test_extreme_logits_stay_finite() -> None:
 
 
 def test_adaptive_beta_is_one_over_the_spread_of_the_critics() -> None:
-    from offbench.algos.bdb import actor_loss
-
     algorithm = make("bdb", [{"beta": "adaptive"}])
     with torch.no_grad():
         algorithm.critic.flat *= 4  # so that the critics disagree by more than 1 somewhere
     batch, _ = next(batches(1))
-    pi = algorithm.actor(batch.observations)[0].tanh()
-    q = algorithm.critic(batch.observations, pi).squeeze(-1).detach()
+    pi = algorithm.actor(batch.observations).tanh()
+    q = algorithm.critic(batch.observations, pi).detach()
     spread = (q[0] - q[1]).abs()
     assert spread.min() < 1 < spread.max()
-    parts = pi, algorithm.critic, algorithm.discriminator, algorithm.learned_beta
     expected = torch.where(spread < 1, torch.ones(()), 1 / spread)
-    _, logs = actor_loss(*parts, batch, algorithm.config, False)
+    logs = algorithm.actor_loss(batch, pi, algorithm.config)
     torch.testing.assert_close(logs["beta"], expected.mean(-1))
     torch.testing.assert_close(logs["uncertainty"], spread.mean(-1))
     algorithm.config.beta_scope = "batch"
-    _, logs = actor_loss(*parts, batch, algorithm.config, False)
+    logs = algorithm.actor_loss(batch, pi, algorithm.config)
     torch.testing.assert_close(logs["beta"], (1 / spread.mean(-1)).clamp(max=1))
 
 
@@ -215,96 +210,3 @@ def test_what_bdb_logs() -> None:
     assert wanted | {"adversarial", "q_abs", "critic_loss", "actor_loss", "discriminator_loss"} == set(log)
     assert all(value.shape == (2,) for value in log.values())
     assert log["beta"][1] == 0.5
-
-
-def beta_after(config: dict[str, Any], steps: int = 2) -> float:
-    algorithm = make("bdb", [config])
-    with torch.no_grad():
-        algorithm.critic.flat *= 4
-    logs = [log for log in run(algorithm, steps) if "beta" in log]
-    return logs[-1]["beta"].item()
-
-
-def test_remedies_for_an_early_beta_near_one() -> None:
-    adaptive = beta_after({"beta": "adaptive"})
-    assert beta_after({"beta": "adaptive", "beta_max": 0.2}) <= 0.2 < adaptive
-    assert beta_after({"beta": "adaptive", "cloning_steps": 2}) == 0.0
-    assert beta_after({"beta": "adaptive", "cloning_steps": 2}, steps=4) > 0.0
-    relative = [beta_after({"uncertainty": "relative", "uncertainty_scale": scale}) for scale in (1.0, 10.0)]
-    assert relative[0] > relative[1]
-    assert beta_after({"beta": 0.6, "beta_max": 0.2}) == pytest.approx(0.6)  # a fixed beta is what it says
-
-
-def test_relative_uncertainty_does_not_change_with_the_size_of_q() -> None:
-    from offbench.algos.bdb import uncertainty
-
-    found = []
-    for factor in (1.0, 50.0):
-        algorithm = make("bdb", [{"uncertainty": "relative"}])
-        batch, _ = next(batches(1))
-        with torch.no_grad():
-            # the weights and bias of the last layer scale Q itself; zeros may follow them
-            last = (
-                len(torch.cat([x.flatten() for layer in algorithm.critic.layers(0) for x in layer])) - HIDDEN[-1] - 1
-            )
-            algorithm.critic.flat[..., last:] *= factor
-        q = algorithm.critic(batch.observations, batch.actions).squeeze(-1).detach()
-        found.append(uncertainty(q, algorithm.config))
-    torch.testing.assert_close(found[0], found[1])
-
-
-@pytest.mark.parametrize(("target", "rises"), [(1e-6, False), (10.0, True)])
-def test_a_learned_beta_holds_the_cloning_error_at_its_target(target: float, rises: bool) -> None:
-    algorithm = make("bdb", [{"beta": "learned", "beta_target": target, "beta_learning_rate": 1e-2}])
-    logs = [log["beta"].item() for log in run(algorithm, 100) if "beta" in log]
-    assert logs[0] == 0.5
-    assert (logs[-1] > 0.55) if rises else (logs[-1] < 0.45)
-
-
-def test_the_learned_betas_gradient_is_that_of_beta_times_the_excess_error() -> None:
-    from offbench.algos.bdb import learned_beta_gradient
-
-    algorithm = make("bdb", [{"beta": "learned", "beta_target": 0.05}, {"beta": 0.5}])
-    with torch.no_grad():
-        algorithm.learned_beta.flat.fill_(0.4)
-    cloning = torch.tensor([0.3, 0.3])
-    found = learned_beta_gradient(algorithm.learned_beta, cloning, algorithm.config, False)
-    b = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(b.sigmoid() * 0.25, [b])
-    assert found.shape == algorithm.learned_beta.flat.shape
-    assert found.flatten().tolist() == pytest.approx([gradient.item(), 0.0])  # a fixed beta stands still
-    assert not learned_beta_gradient(algorithm.learned_beta, cloning, algorithm.config, True).any()
-
-
-def test_the_critic_penalty_by_hand() -> None:
-    from offbench.algos.bdb import conservative_penalty
-
-    algorithm = make("bdb", [{"critic_penalty": "cql", "penalty_actions": 3}])
-    batch, _ = next(batches(1))
-    assert algorithm.draws["uniform"].shape == (3, BATCH, ACT)
-    uniform = torch.rand(1, 3, BATCH, ACT) * 2 - 1
-    found = conservative_penalty(algorithm.critic, algorithm.actor, batch, uniform)
-    expected = 0.0
-    with torch.no_grad():
-        for i in range(BATCH):
-            s, s2 = batch.observations[0, i], batch.next_observations[0, i]
-            actions = [*uniform[0, :, i], *(algorithm.actor(x.view(1, 1, -1)).tanh().flatten() for x in (s, s2))]
-            for c in range(2):
-                q = [algorithm.critic(s.view(1, 1, -1), a.view(1, 1, -1))[c].item() for a in actions]
-                data = algorithm.critic(s.view(1, 1, -1), batch.actions[0, i].view(1, 1, -1))[c].item()
-                expected += (torch.tensor(q, dtype=torch.float64).exp().sum().log().item() - data) / BATCH
-    assert found.item() == pytest.approx(expected, abs=1e-4)
-
-
-def test_the_critic_penalty_lowers_q_off_the_data() -> None:
-    gaps = []
-    for weight in (0.0, 5.0):
-        config = {"critic_penalty": "cql", "penalty_weight": weight, "critic_learning_rate": 3e-3}
-        algorithm = make("bdb", [config])
-        batch, noise = next(batches(1))  # the same one again and again: there is a data set to stay near
-        for step in range(200):
-            uniform = torch.rand(1, 10, BATCH, ACT, generator=torch.Generator().manual_seed(step)) * 2 - 1
-            algorithm.update(batch, noise | {"uniform": uniform}, algorithm.kind(step))
-        on, off = (algorithm.critic(batch.observations, a).mean().item() for a in (batch.actions, -batch.actions))
-        gaps.append(on - off)
-    assert gaps[1] > gaps[0] + 0.3

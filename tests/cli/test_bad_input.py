@@ -52,7 +52,7 @@ CASES: dict[str, tuple[str, str]] = {
     "train bdb --dataset x-v0": ("unknown dataset 'x-v0'", "offbench collect"),
     "train bdb --dataset ../x-v0": ("unknown dataset '../x-v0'", ""),
     "train bdb --dataset MEDIUM --beta 2": ("bdb: beta must be at most 1, not 2", ""),
-    "train bdb --dataset MEDIUM --beta adaptve": ("beta must be one of adaptive, learned, not 'adaptve'", ""),
+    "train bdb --dataset MEDIUM --beta adaptve": ("beta must be one of adaptive, not 'adaptve'", ""),
     "train bdb --dataset MEDIUM --alpha nan": ("alpha must be a finite number", ""),
     "train bdb --dataset MEDIUM --alpha -1": ("alpha must be at least 0", ""),
     "train bdb --dataset MEDIUM --critics 1": ("critics must be at least 2", ""),

@@ -25,6 +25,7 @@ from offbench.common.tables import markdown
 from offbench.envs.environments import make_env
 from offbench.envs.recipes import load_recipe
 from offbench.rollouts.rollouts import LANES, Episode, Task, play
+from offbench.training.stack import RECORDED
 from tests.speed.__main__ import DOCS
 from tests.speed.sides import ENV, stack_of
 
@@ -80,7 +81,7 @@ def update(algorithm: str, precision: str) -> dict[str, float]:
     """Return milliseconds of an update (2-layer networks), by what a replay calls."""
     with products_by("bfloat16" if precision == "bfloat16" else "numpy"):
         stack = stack_of(algorithm)
-        for _ in stack.train(10):  # records each kind of update
+        for _ in stack.train(2 * RECORDED):  # records each phase
             pass
     kinds = [list(calls(recording)) for recording in stack.program._recordings.values()]
     spent: dict[str, float] = {}

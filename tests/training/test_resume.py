@@ -26,6 +26,7 @@ SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 100
 EXTRA: dict[str, dict[str, Any]] = {
     "td3_bc": {},
     "bdb": {},
+    "bdb_plus": {"critic_penalty": "cql", "penalty_actions": 3, "cloning_steps": 150, "beta": "learned"},
     "bc": {},
     "cql": {"num_actions": 2, "bc_steps": 150, "eval_samples": 3},
 }
@@ -146,10 +147,10 @@ def test_two_datasets_in_a_stack_equal_each_alone(tiny: tuple[str, str], medium:
 
 
 def test_a_learned_beta_beside_a_fixed_one_resumes_right(medium: str) -> None:
-    whole = train("bdb", medium, "whole", 200, beta=["learned", 0.25], beta_learning_rate=1e-2)
+    whole = train("bdb_plus", medium, "whole", 200, beta=["learned", 0.25], beta_learning_rate=1e-2)
     for beta in ("learned", 0.25):  # apart first, then together
-        train("bdb", medium, "runs", 100, beta=beta, beta_learning_rate=1e-2)
-    together = train("bdb", medium, "runs", 200, beta=["learned", 0.25], beta_learning_rate=1e-2)
+        train("bdb_plus", medium, "runs", 100, beta=beta, beta_learning_rate=1e-2)
+    together = train("bdb_plus", medium, "runs", 200, beta=["learned", 0.25], beta_learning_rate=1e-2)
     for a, b in zip(whole, together, strict=True):
         ours, theirs = (load_file(run.folder / "checkpoint-000000200.safetensors") for run in (a, b))
         for name in ours:

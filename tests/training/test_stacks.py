@@ -141,13 +141,13 @@ def test_any_number_of_settings_has_a_folder(medium: str) -> None:
     settings |= {"beta_scope": "batch", "critics": 3, "uncertainty": "relative", "uncertainty_scale": 2.0}
     settings |= {"beta_max": 0.5, "cloning_steps": 1, "critic_penalty": "cql", "penalty_weight": [2.0, 3.0]}
     more: dict[str, Any] = {"steps": 2, "eval_every": 2, "eval_episodes": 1, "workers": 1, **SMALL, **settings}
-    folders = offbench.train("bdb", medium, **more)
+    folders = offbench.train("bdb_plus", medium, **more)
     assert len(set(folders)) == 2
     assert all(len(part.encode()) <= 255 for folder in folders for part in folder.parts)
     variants = [Run(folder).config()["variant"] for folder in folders]
     assert ["penalty_weight=2," in variants[0], "penalty_weight=3," in variants[1]] == [True, True]
-    assert offbench.train("bdb", medium, **more) == folders  # finished already
-    found = offbench.compare(*[f"bdb/{folder.parent.name}" for folder in folders])
+    assert offbench.train("bdb_plus", medium, **more) == folders  # finished already
+    found = offbench.compare(*[f"bdb_plus/{folder.parent.name}" for folder in folders])
     assert found.a.endswith(variants[0])
     assert found.b.endswith(variants[1])
 

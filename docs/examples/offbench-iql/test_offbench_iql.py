@@ -27,8 +27,8 @@ def network(layers: list[tuple[Any, Any]]) -> nn.Sequential:
 def copies(stacked: Any, run: int) -> list[nn.Sequential]:
     """One run's networks of a stacked one, read from its flat tensor."""
     found = []
-    for copy in range(stacked.copies):
-        flat, layers = stacked.flat.detach()[copy, run], []
+    for member in range(stacked.ensemble_size):
+        flat, layers = stacked.flat.detach()[member, run], []
         for fan_in, fan_out in zip(stacked.sizes, stacked.sizes[1:], strict=False):
             weight, flat = flat[: fan_in * fan_out].view(fan_in, fan_out), flat[fan_in * fan_out :]
             bias, flat = flat[:fan_out], flat[fan_out:]
@@ -90,13 +90,14 @@ def test_losses_and_parameters_follow_the_equations() -> None:
         a = torch.rand(2, BATCH, ACT, generator=generator) * 2 - 1
         r = torch.randn(2, BATCH, generator=generator)
         masks = (torch.rand(2, BATCH, generator=generator) > 0.2).float()
-        logs = stack.update(Batch(s, a, r, s2, masks), {}, stack.kind(0))
+        logs = stack.update(Batch(s, a, r, s2, masks), {}, stack.phase(0))
+        logs = {name: value.detach() for name, value in logs.items()}
         for run, reference in enumerate(references):
             config = configs[run]
             alone = [x[run].double() for x in (s, a, r, s2, masks)]
             losses = reference.update(alone, config.expectile, config.temperature, config.reward_scale)
             for name, loss in losses.items():
-                assert float(logs[name][run]) == pytest.approx(loss, rel=1e-4, abs=1e-5), name
+                assert logs[name][run].item() == pytest.approx(loss, rel=1e-4, abs=1e-5), name
     for run, reference in enumerate(references):
         for mine, theirs in ((stack.actor, [reference.actor]), (stack.value, [reference.value])):
             assert_same(copies(mine, run), theirs)
