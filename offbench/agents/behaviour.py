@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from offbench.agents.build_ladder import build_ladder, check_place
+from offbench.agents.build_ladder import build_ladder, check_output_folder
 from offbench.agents.ladder import BEHAVIOUR, Ladder, folder_of
-from offbench.agents.sac import Training, train
+from offbench.agents.sac import train
+from offbench.agents.training_folder import TrainingFolder
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import default_workers
 from offbench.envs.recipes import Recipe, load_recipe
@@ -21,13 +22,13 @@ def behaviour(
     behaviour_dir: str | Path = BEHAVIOUR,
     out: str | Path | None = None,
 ) -> Ladder:
-    """Train SAC on an environment, going on where an earlier call stopped, and build its ladder.
+    """Train SAC on an environment, resuming from the last checkpoint, and build its ladder.
 
     Args:
         env: a shipped recipe's name, a recipe file, or a Recipe.
         seed: of the training. The same recipe and seed end with the same weights.
-        steps: environment steps; default: the recipe's. More than the recipe's trains on at its last
-            learning rate; fewer than already trained builds the ladder of the first `steps`.
+        steps: environment steps; default: the recipe's. Steps beyond the recipe's use its final learning
+            rate; fewer than already trained builds the ladder of the first `steps`.
         workers: processes that measure the rungs (training itself is one process of one thread).
         behaviour_dir: the folder of all trainings.
         out: where the ladder goes; default: `ladder` in the training's folder.
@@ -40,8 +41,8 @@ def behaviour(
     segment = recipe.sac.segment
     if steps < segment or steps % segment:
         raise OffbenchError(f"steps must be a multiple of {segment} (the recipe's segment), not {steps}")
-    training = Training(recipe, seed, folder_of(recipe, seed, Path(behaviour_dir)))
-    place = check_place(Path(out) if out else training.folder / "ladder")
-    train(training, steps)
+    folder = TrainingFolder(recipe, seed, folder_of(recipe, seed, Path(behaviour_dir)))
+    ladder = check_output_folder(Path(out) if out else folder.path / "ladder")
+    train(folder, steps)
     command = f"offbench behaviour {recipe.name} --seed {seed} --steps {steps}"
-    return build_ladder(training, steps, place, default_workers(workers), command)
+    return build_ladder(folder, steps, ladder, default_workers(workers), command)

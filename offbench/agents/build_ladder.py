@@ -1,25 +1,31 @@
 """Building the ladder: which rungs recording needs, chosen by measured return.
 
-    a training's folder (every rung, a few episodes each)
+    a training's folder (a rung for each segment, screened over a few episodes; more policies within segments)
         -> expert   the best of the late rungs, by measured return
-        -> medium   the first rung at one third (to 0.45) of the expert's normalised return
-        -> others   the rungs nearest 1/12, 2/12, ... of it, for `--level FRACTION`
+        -> medium   the first policy at one third (to 0.45) of the expert's normalized return
+        -> others   the policies nearest each tenth of it, for `--level FRACTION`
         -> ladder/  ladder.json  ladder.csv  policies/*.safetensors  medium-replay.hdf5
 
-Returns are of the sampling policy, normalised between the uniform-random and the expert reference. A rung is
-chosen on one set of episodes; the expert's reference score is measured on another, so being chosen for its
-luck does not flatter it.
+Returns are of the sampling policy, normalized between the uniform-random and the expert reference. Policies within
+segments are looked at where no rung at the end of a segment fits. A rung is chosen on one set of episodes; the
+expert's reference score is measured on another, so that it is not flattered by the choice.
 """
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from offbench.agents.ladder import MEDIUM, MEDIUM_AT_MOST, Ladder, read_ladder
+from offbench.agents.medium_replay import replay_episodes, save_replay
+from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common.errors import OffbenchError
 from offbench.common.files import csv_bytes, disk_errors, read_json, write_bytes, write_json
 from offbench.common.provenance import versions
@@ -28,41 +34,63 @@ from offbench.envs.environments import make_env
 from offbench.rollouts.policy import Policy, load_policy, uniform
 from offbench.rollouts.rollouts import MEASURES, Outcome, Rollouts, result, summary
 
-if TYPE_CHECKING:
-    from offbench.agents.sac import Training
-
-CANDIDATES = 8  # late rungs that are measured to find the expert
+CANDIDATES = 8  # late rungs that are measured to choose the expert
 LOOKS = 6  # rungs that are measured to find the one nearest a return
+CROSSINGS = 3  # pairs of neighboring rungs between which policies within a segment are measured
 COLUMNS = ("step", "hours", "role", "policy", *MEASURES, *(f"deterministic_{m}" for m in MEASURES), "episodes")
 
 
-class Surveyor:
-    """Measures rungs of a training, each at most once."""
+class RungEvaluator:
+    """Measures policies of a training, each at most once, and chooses among them.
 
-    def __init__(self, training: Training, rows: list[dict[str, float]], rollouts: Rollouts) -> None:
-        self.training, self.rollouts = training, rollouts
+    Args:
+        folder: of the training.
+        rows: of rungs.csv, for the rungs at the ends of segments.
+        policy_steps: of all policies that were kept, those within segments included.
+        rollouts: where episodes are played.
+    """
+
+    def __init__(
+        self,
+        folder: TrainingFolder,
+        rows: Sequence[dict[str, float]],
+        policy_steps: Sequence[int],
+        rollouts: Rollouts,
+    ) -> None:
+        self.folder, self.rollouts = folder, rollouts
         self.screened = {int(row["step"]): row for row in rows}
+        self.within = [step for step in policy_steps if step not in self.screened]
         self.measured: dict[int, dict[str, float]] = {}
 
     def measure(self, step: int) -> float:
-        """Return the mean return of a rung over the recipe's `rung_episodes`."""
+        """Return the mean return of a policy over the recipe's `rung_episodes`."""
         if step not in self.measured:
-            policy = load_policy(self.training.policy(step))
-            count = self.training.recipe.measure.rung_episodes
+            policy = load_policy(self.folder.policy(step))
+            count = self.folder.recipe.measure.rung_episodes
             row: dict[str, float] = {"episodes": count}
             for prefix, deterministic in (("", False), ("deterministic_", True)):
                 stream = (int(Purpose.MEASURE), step, int(deterministic))
                 row |= summary(self.run(policy, stream, count, deterministic), prefix)
             self.measured[step] = row
-            _say(f"rung {step}: return {row['return']:.1f} over {count} episodes")
+            print(
+                f"offbench: policy of step {step:,}: return {row['return']:.1f} over {count} episodes",
+                file=sys.stderr,
+                flush=True,
+            )
         return self.measured[step]["return"]
 
     def run(self, policy: Policy, stream: tuple[int, ...], count: int, deterministic: bool = False) -> list[Outcome]:
         """Play evaluation episodes."""
         outcomes: list[Outcome] = result(
-            self.rollouts.outcomes(policy, self.training.seed, stream, count, deterministic)
+            self.rollouts.outcomes(policy, self.folder.seed, stream, count, deterministic)
         )
         return outcomes
+
+    def estimate(self, step: int) -> float:
+        """Return the return of a rung, as measured, or as screened if it was not measured."""
+        if step == 0:
+            return -math.inf  # before training
+        return self.measured[step]["return"] if step in self.measured else self.screened[step]["stochastic_return"]
 
     def expert(self) -> int:
         """Return the best rung of the second half by measured return."""
@@ -72,37 +100,66 @@ class Surveyor:
         return max(late[:CANDIDATES], key=self.measure)
 
     def medium(self, target: float, most: float, expert: int) -> int:
-        """Return the first rung measured between `target` and `most`, else the one nearest to `target`."""
+        """Return the first policy measured between `target` and `most`, else the one nearest to `target`."""
         early = [step for step in sorted(self.screened) if step <= expert]
-        for step in early:
+        for before, step in pairwise([0, *early]):
             # measure only what its screening interval says might lie there
             if self.screened[step]["stochastic_high"] >= target and target <= self.measure(step) <= most:
                 return step
+            if (between := self._between(before, step, target, most)) is not None:
+                return between
         return self.nearest(target, most - target, early)
 
     def nearest(self, target: float, close: float, among: Iterable[int] | None = None) -> int:
-        """Return the rung (of those `among`) whose return lies nearest `target`, as measured.
+        """Return the policy whose return lies nearest `target`, as measured.
 
         The few episodes that screened the rungs say where to look: the most promising are measured in turn,
-        until one proves to lie within `close` or nothing that was not measured looks nearer.
+        until one proves to lie within `close` or nothing that was not measured looks nearer. If none does, the
+        policies between neighboring rungs on either side of `target` are measured, by halving.
+
+        Args:
+            target: the wanted return.
+            close: a distance that ends the search.
+            among: the rungs to choose from, with the policies between them (default: all).
         """
-        steps = list(self.screened if among is None else among)
-
-        def distance(step: int) -> float:
-            known = self.measured.get(step, {}).get("return", self.screened[step]["stochastic_return"])
-            return abs(known - target)
-
+        steps = sorted(self.screened if among is None else among)
         for _ in range(LOOKS):
-            step = min(steps, key=distance)
+            step = min(steps, key=lambda step: abs(self.estimate(step) - target))
             if step in self.measured:
+                break
+            if abs(self.measure(step) - target) <= close:
                 return step
-            self.measure(step)
-            if distance(step) <= close:
-                return step
-        return min((step for step in steps if step in self.measured), key=distance)
+        low, high = target - close, target + close
+        crossings = [pair for pair in pairwise([0, *steps]) if self._opposite(*pair, low, high) and self._kept(*pair)]
+        for pair in crossings[:CROSSINGS]:
+            if (between := self._between(*pair, low, high)) is not None:
+                return between
+        candidates = [step for step in self.measured if step in steps or (step in self.within and step < steps[-1])]
+        return min(candidates, key=lambda step: abs(self.measure(step) - target))
+
+    def _between(self, first: int, last: int, low: float, high: float) -> int | None:
+        """Return a policy between two rungs that returns `low` to `high`, if halving leads to one."""
+        if not self._opposite(first, last, low, high):
+            return None
+        rises = self.estimate(first) < low
+        while kept := self._kept(first, last):
+            middle = kept[len(kept) // 2]
+            if low <= self.measure(middle) <= high:
+                return middle
+            first, last = (middle, last) if (self.measure(middle) < low) == rises else (first, middle)
+        return None
+
+    def _kept(self, first: int, last: int) -> list[int]:
+        """Return the steps of the policies that were kept between two rungs."""
+        return [step for step in self.within if first < step < last]
+
+    def _opposite(self, first: int, last: int, low: float, high: float) -> bool:
+        """Return whether one of two rungs returns less than `low` and the other more than `high`."""
+        less, more = sorted((self.estimate(first), self.estimate(last)))
+        return less < low and high < more
 
 
-def check_place(out: Path) -> Path:
+def check_output_folder(out: Path) -> Path:
     """Return the folder where a ladder may be written, absolute.
 
     Raises:
@@ -118,40 +175,39 @@ def check_place(out: Path) -> Path:
     return out
 
 
-def build_ladder(training: Training, steps: int, out: Path, workers: int, command: str) -> Ladder:
+def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, command: str) -> Ladder:
     """Choose and measure the rungs of a training up to `steps`, and write the ladder's folder `out`.
 
     Raises:
         OffbenchError: no rung beats the random policy, or the disk refuses.
     """
-    from offbench.agents.sac import read_rungs  # here, because behaviour needs PyTorch and collect does not
-
-    rows = [row for row in read_rungs(training.rungs) if row["step"] <= steps]
+    rows = [row for row in read_rungs(folder.rungs) if row["step"] <= steps]
     if not rows:
-        raise OffbenchError(f"{training.folder} has no rung yet; train at least one segment")
-    spec = training.recipe.env_spec()
+        raise OffbenchError(f"{folder.path} has no rung yet; train at least one segment")
+    spec = folder.recipe.env_spec()
     with Rollouts(spec, workers) as rollouts:
-        surveyor = Surveyor(training, rows, rollouts)
-        episodes = training.recipe.measure.reference_episodes
-        random = _random_policy(spec, training.recipe.env_id)
-        references = {"random": summary(surveyor.run(random, (int(Purpose.REFERENCE), 0), episodes))}
-        expert = surveyor.expert()
-        policy = load_policy(training.policy(expert))
-        references["expert"] = summary(surveyor.run(policy, (int(Purpose.REFERENCE), 1), episodes))
+        evaluator = RungEvaluator(folder, rows, [s for s in folder.policy_steps() if s <= steps], rollouts)
+        episodes = folder.recipe.measure.reference_episodes
+        random = _random_policy(spec, folder.recipe.env_id)
+        references = {"random": summary(evaluator.run(random, (int(Purpose.REFERENCE), 0), episodes))}
+        expert = evaluator.expert()
+        policy = load_policy(folder.policy(expert))
+        references["expert"] = summary(evaluator.run(policy, (int(Purpose.REFERENCE), 1), episodes))
         worst, best = references["random"]["return"], references["expert"]["return"]
         if best <= worst:
             raise OffbenchError(
                 f"after {steps:,} steps no rung beats the random policy: the best returns {best:.1f} over "
-                f"{episodes} fresh episodes, random {worst:.1f}; train on with `offbench behaviour ENV --steps N`"
+                f"{episodes} fresh episodes, random {worst:.1f}; train for longer with "
+                "`offbench behaviour ENV --steps N`"
             )
-        medium = surveyor.medium(worst + MEDIUM * (best - worst), worst + MEDIUM_AT_MOST * (best - worst), expert)
-        parts = training.recipe.measure.rungs
+        medium = evaluator.medium(worst + MEDIUM * (best - worst), worst + MEDIUM_AT_MOST * (best - worst), expert)
+        parts = max(folder.recipe.measure.rungs - 2, 1)  # beside medium and expert
         part = (best - worst) / parts
-        others = {surveyor.nearest(worst + i * part, part / 4) for i in range(1, parts)}
+        others = {evaluator.nearest(worst + i * part, part / 4) for i in range(1, parts)}
     roles: dict[int, str] = dict.fromkeys(sorted(others | {medium, expert}), "")
     for step, role in ((medium, "medium"), (expert, "expert")):
         roles[step] = f"{roles[step]}+{role}".lstrip("+")
-    trained = read_json(training.folder / "training.json")
+    trained = read_json(folder.path / "training.json")
     info = trained | {
         "versions": trained["versions"] | {"offbench": versions()["offbench"]},
         "format": "offbench-ladder-1",
@@ -161,7 +217,7 @@ def build_ladder(training: Training, steps: int, out: Path, workers: int, comman
         "references": {name: values | {"episodes": episodes} for name, values in references.items()},
         "levels": {"medium": medium, "expert": expert},
     }
-    _write(training, out, rows, surveyor, roles, info)
+    _write(folder, out, rows, evaluator, roles, info)
     ladder = read_ladder(out)
     assert ladder is not None
     return ladder
@@ -176,47 +232,48 @@ def _random_policy(spec: str, env_id: str) -> Policy:
 
 
 def _write(
-    training: Training,
+    folder: TrainingFolder,
     out: Path,
     rows: list[dict[str, float]],
-    surveyor: Surveyor,
+    evaluator: RungEvaluator,
     roles: dict[int, str],
     info: dict[str, Any],
 ) -> None:
-    """Write the ladder aside, then put it in its place; ladder.json says it is whole."""
-    from offbench.agents.medium_replay import replay_episodes, save_replay
-
-    aside = out.with_name(f".{out.name}.partial")
+    """Write the ladder to a temporary folder, then rename it; ladder.json, written last, says it is complete."""
+    temporary = out.with_name(f".{out.name}.partial")
     with disk_errors(str(out)):
-        shutil.rmtree(aside, ignore_errors=True)
-        (aside / "policies").mkdir(parents=True)
+        shutil.rmtree(temporary, ignore_errors=True)
+        (temporary / "policies").mkdir(parents=True)
         for step in roles:
-            # written anew: a policy of an older offbench has no hash of its own yet
-            load_policy(training.policy(step)).save(aside / "policies" / training.policy(step).name)
-        write_bytes(aside / "ladder.csv", csv_bytes(COLUMNS, _table(training, rows, surveyor, roles)))
+            # saved anew: a policy of an older offbench has no hash of its own yet
+            load_policy(folder.policy(step)).save(temporary / "policies" / folder.policy(step).name)
+        write_bytes(temporary / "ladder.csv", csv_bytes(COLUMNS, _table(folder, rows, evaluator, roles)))
         info["medium_replay"] = save_replay(
-            aside / "medium-replay.hdf5", replay_episodes(training, info["levels"]["medium"])
+            temporary / "medium-replay.hdf5", replay_episodes(folder, info["levels"]["medium"])
         )
-        write_json(aside / "ladder.json", info)
+        write_json(temporary / "ladder.json", info)
         old = out.with_name(f".{out.name}.old")
         shutil.rmtree(old, ignore_errors=True)
         if out.exists():
             out.replace(old)
-        aside.replace(out)
+        temporary.replace(out)
         shutil.rmtree(old, ignore_errors=True)
 
 
 def _table(
-    training: Training, rows: list[dict[str, float]], surveyor: Surveyor, roles: dict[int, str]
+    folder: TrainingFolder, rows: list[dict[str, float]], evaluator: RungEvaluator, roles: dict[int, str]
 ) -> Iterator[list[Any]]:
-    """Yield a row for every rung: measured where it was measured, screened elsewhere; `episodes` says which."""
-    for row in rows:
-        step = int(row["step"])
-        values = {key.removeprefix("stochastic_"): value for key, value in row.items()}
-        values |= surveyor.measured.get(step, {})
-        kept = {"role": roles.get(step, ""), "policy": training.policy(step).name if step in roles else ""}
-        yield [(values | kept)[key] for key in COLUMNS]
+    """Yield a row for every rung, and for the policies within segments that were measured.
 
-
-def _say(line: str) -> None:
-    print(f"offbench: {line}", file=sys.stderr, flush=True)
+    Returns are as measured where they were measured, as screened elsewhere; `episodes` says which.
+    """
+    screened = {
+        int(row["step"]): {key.removeprefix("stochastic_"): value for key, value in row.items()} for row in rows
+    }
+    times = [row["hours"] for row in rows]
+    for step in sorted(screened.keys() | evaluator.measured.keys()):
+        hours = round(float(np.interp(step, list(screened), times)), 4)
+        values: dict[str, Any] = {"step": step, "hours": hours, **screened.get(step, {})}
+        values |= evaluator.measured.get(step, {})
+        values |= {"role": roles.get(step, ""), "policy": folder.policy(step).name if step in roles else ""}
+        yield [values[key] for key in COLUMNS]

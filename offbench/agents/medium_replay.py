@@ -21,7 +21,7 @@ from offbench.common.files import read_bytes, sha256, write_bytes
 from offbench.rollouts.rollouts import Episode
 
 if TYPE_CHECKING:
-    from offbench.agents.sac import Training
+    from offbench.agents.training_folder import TrainingFolder
 
 CHUNK_ROWS = 65_536
 NO_SEED = -1  # episodes of a training have no reset seed of their own
@@ -37,13 +37,16 @@ class Piece(NamedTuple):
     stream: int
 
 
-def replay_episodes(training: Training, until: int) -> Iterator[Piece]:
+def replay_episodes(folder: TrainingFolder, until: int) -> Iterator[Piece]:
     """Yield the episodes of a training's first `until` steps, segment by segment, stream by stream."""
-    segment = training.recipe.sac.segment
-    for end in range(segment, until + 1, segment):
-        with np.load(training.transitions(end), allow_pickle=False) as file:
+    segment = folder.recipe.sac.segment
+    for start in range(0, until, segment):
+        with np.load(folder.transitions(start + segment), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        for stream in range(arrays["rewards"].shape[1]):
+        streams = arrays["rewards"].shape[1]
+        rows = (until - start) // streams  # all of them, except in the segment that `until` lies in
+        arrays = {name: array[:rows] for name, array in arrays.items()}
+        for stream in range(streams):
             yield from _cut({name: array[:, stream] for name, array in arrays.items()}, stream)
 
 

@@ -1,11 +1,14 @@
-"""Behaviour agents: Stable-Baselines3's SAC, trained in segments that each leave a rung of the ladder.
+"""Behaviour agents: Stable-Baselines3's SAC, trained in segments that each end with a rung of the ladder.
 
     segment k:  fresh episodes, generators seeded by (seed, SAC, k)  -->  rung (policy + screening returns)
+                                                                     -->  policies within the segment, where the
+                                                                          return changed much
                                                                      -->  the segment's transitions
-                                                                     -->  checkpoint (weights, optimisers)
+                                                                     -->  checkpoint (weights, optimizers)
 
 A segment depends only on the checkpoint before it and on k, so a training that was killed and resumed ends
 with the same bits as one that was not. The price is that episodes running at a segment's end are truncated.
+Ctrl-C and SIGTERM save a checkpoint where they arrive, from which a resume ends with the same bits, too.
 """
 
 from __future__ import annotations
@@ -15,88 +18,72 @@ import json
 import sys
 import time
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from offbench.agents.sac_checkpoint import restore, save_segment_end, save_within_segment, transitions_since
+from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common import checkpoints, seeds
 from offbench.common.arrays import Array
-from offbench.common.checkpoints import keep_newest, load_newest, save_checkpoint
 from offbench.common.errors import OffbenchError
 from offbench.common.files import csv_bytes, disk_errors, read_json, remove_leftovers, sole, write_bytes, write_json
-from offbench.common.progress import Progress
+from offbench.common.processes import stops_noted
+from offbench.common.progress import Progress, duration
 from offbench.common.provenance import hardware, versions
 from offbench.common.seeds import Purpose
 from offbench.envs.environments import make_env
-from offbench.envs.recipes import Recipe
+from offbench.envs.recipes import Recipe, SACSettings
 from offbench.rollouts.policy import Policy
 from offbench.rollouts.rollouts import MEASURES, Rollouts, summary
 
 SCREENED = ("step", "hours", *(f"{how}_{m}" for how in ("stochastic", "deterministic") for m in MEASURES), "episodes")
-OPTIMISERS = ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer")
+POLICIES = 20  # of a segment, its rung included
+FAR_APART = 0.05  # of the range of returns so far: half the distance between the rungs of a ladder
+STEP_WORK = 0.02  # time of an environment step, in gradient steps: for the time left
+PROBE = 1.0  # seconds at most that the estimate of a training's time takes
+PROBE_CYCLES, WARM_UP = 50, 4
 
 
-@dataclass(frozen=True)
-class Training:
-    """Where one behaviour agent's training lives: a folder of plain files."""
-
-    recipe: Recipe
-    seed: int
-    folder: Path
-
-    @property
-    def rungs(self) -> Path:
-        """The screening returns of every rung."""
-        return self.folder / "rungs.csv"
-
-    def policy(self, step: int) -> Path:
-        """The policy file of the rung at `step`."""
-        return self.folder / "policies" / f"{step:09d}.safetensors"
-
-    def transitions(self, step: int) -> Path:
-        """The transitions of the segment that ended at `step`."""
-        return self.folder / "transitions" / f"{step:09d}.npz"
-
-
-def train(training: Training, steps: int) -> None:
-    """Train the behaviour agent up to `steps` environment steps, going on from its newest checkpoint.
+def train(folder: TrainingFolder, steps: int) -> None:
+    """Train the behaviour agent up to `steps` environment steps, resuming from its newest checkpoint.
 
     Raises:
         OffbenchError: the folder belongs to another recipe or seed, is in use, or the disk refuses.
+        KeyboardInterrupt: after Ctrl-C (or whatever SIGTERM raises), once a checkpoint is written.
     """
-    with sole(training.folder / ".lock", f"{training.folder} is being trained"):
-        remove_leftovers(training.folder)
-        _claim(training)
-        if max(checkpoints.steps(training.folder), default=0) < steps:
-            _train(training, steps)
+    with sole(folder.path / ".lock", f"{folder.path} is being trained"):
+        remove_leftovers(folder.path)
+        _check_identity(folder)
+        if max(checkpoints.steps(folder.path), default=0) < steps:
+            _train(folder, steps)
 
 
-def _claim(training: Training) -> None:
-    """Write what this folder is, or check that it is the same as when it was begun."""
-    recipe = dataclasses.asdict(training.recipe)
-    identity = {"seed": training.seed, "env_id": recipe["env_id"], "env_kwargs": dict(recipe["env_kwargs"])}
+def _check_identity(folder: TrainingFolder) -> None:
+    """Write what is trained in this folder, or check that it is the same as when it was started."""
+    recipe = dataclasses.asdict(folder.recipe)
+    identity = {"seed": folder.seed, "env_id": recipe["env_id"], "env_kwargs": dict(recipe["env_kwargs"])}
     identity["sac"] = recipe["sac"] | {"hidden": list(recipe["sac"]["hidden"])}
-    path = training.folder / "training.json"
-    if path.exists():
-        begun = {key: value for key, value in read_json(path).items() if key in identity}
-        known, wanted = _flat(begun), _flat(json.loads(json.dumps(identity)))
-        other = [key for key in known | wanted if known.get(key) != wanted.get(key)]
-        if other:
-            was, is_ = (table.get(other[0], "none") for table in (known, wanted))
-            raise OffbenchError(
-                f"{training.folder} holds another training, with {other[0]} {was}, not {is_}; delete it to train anew "
-                "(to train on, keep the recipe: `offbench behaviour ENV --steps N`)"
-            )
+    path = folder.path / "training.json"
+    if not path.exists():
+        write_json(path, identity | {"recipe_sha256": folder.recipe.sha256(), "versions": versions()} | hardware())
         return
-    write_json(path, identity | {"recipe_sha256": training.recipe.sha256(), "versions": versions()} | hardware())
+    started = _flat({key: value for key, value in read_json(path).items() if key in identity})
+    wanted = _flat(json.loads(json.dumps(identity)))
+    changed = [key for key in started | wanted if started.get(key) != wanted.get(key)]
+    if changed:
+        old, new = (table.get(changed[0], "none") for table in (started, wanted))
+        raise OffbenchError(
+            f"{folder.path} holds another training, with {changed[0]} {old}, not {new}; delete it to train again "
+            "(to train for longer, keep the recipe: `offbench behaviour ENV --steps N`)"
+        )
 
 
 def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -107,32 +94,70 @@ def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
     return inner | {key: value for key, value in table.items() if not isinstance(value, dict)}
 
 
-def _train(training: Training, steps: int) -> None:
-    settings, seed = training.recipe.sac, training.seed
+def _train(folder: TrainingFolder, steps: int) -> None:
+    """Train segment after segment, until `steps`, Ctrl-C or SIGTERM."""
+    recipe, settings = folder.recipe, folder.recipe.sac
     torch.set_num_threads(1)
-    spec = training.recipe.env_spec()
-    model = _make_sac(training.recipe, spec, steps)
-    step, seconds = _resume(training, model)
-    rows = [row for row in read_rungs(training.rungs) if row["step"] <= step]
-    title = f"SAC on {training.recipe.name}"
-    with Rollouts(spec) as rollouts, Progress(steps, title, start=step) as progress:
-        while step < steps:
-            began = time.monotonic()
-            _learn_segment(model, settings, seed, step)
-            step += settings.segment
-            seconds += time.monotonic() - began
-            policy = export_actor(model, training.recipe.env_id, {"algorithm": "SAC", "step": step, "seed": seed})
-            row = {"step": step, "hours": round(seconds / 3600, 4)} | _screen(
-                rollouts, policy, seed, step, settings.rung_episodes
-            )
-            rows.append(row)
-            _save_segment(training, model, policy, rows, seconds)
-            progress.to(step, f"return {row['stochastic_return']:.0f}")
+    title, spec = f"SAC on {recipe.name}", recipe.env_spec()
+    with stops_noted(second_at_once=True) as stops, Rollouts(spec) as rollouts:
+        pace = _seconds_of_a_gradient_step(recipe, spec)  # draws from the generators that a checkpoint restores
+        model = _make_sac(recipe, spec, steps + settings.segment)
+        seconds = _start_or_resume(folder, model)
+        rows = [row for row in read_rungs(folder.rungs) if row["step"] <= model.num_timesteps]
+        with Progress(steps, title, work=_work(settings, steps)) as progress:
+            progress.skip(model.num_timesteps, _work(settings, model.num_timesteps))
+            progress.say(_plan(recipe, pace, model.num_timesteps, steps))
+            while model.num_timesteps < steps and not stops:
+                start = time.monotonic()
+                finished = _train_segment(folder, model, progress, stops)
+                seconds += time.monotonic() - start
+                if finished:
+                    rows.append(_end_segment(folder, model, rollouts, rows, seconds))
+                    progress.to(
+                        model.num_timesteps,
+                        f"return {rows[-1]['stochastic_return']:.0f}",
+                        _work(settings, model.num_timesteps),
+                    )
+                elif model.num_timesteps % settings.segment:
+                    save_within_segment(folder, model, seconds)
+            if stops and model.num_timesteps:
+                progress.say(f"{title}: stopped at step {model.num_timesteps:,}, checkpoint saved")
 
 
-def _make_sac(recipe: Recipe, spec: str, steps: int) -> SAC:
+def _work(settings: SACSettings, step: int) -> float:
+    """Return the time that `step` environment steps take, in gradient steps."""
+    return STEP_WORK * step + settings.gradient_steps * max(step - settings.learning_starts, 0)
+
+
+def _plan(recipe: Recipe, pace: float, first: int, steps: int) -> str:
+    """Return a line that says what is trained, and how long it will take on this machine."""
+    updates = round(recipe.sac.gradient_steps * max(steps - max(first, recipe.sac.learning_starts), 0))
+    start = f"resuming from step {first:,} of" if first else "training for"
+    seconds = pace * (_work(recipe.sac, steps) - _work(recipe.sac, first))
+    return (
+        f"SAC on {recipe.name}: {start} {steps:,} environment steps, {updates:,} gradient steps to go: "
+        f"about {duration(seconds)} on one core; Ctrl-C saves a checkpoint, and the same command resumes"
+    )
+
+
+def _seconds_of_a_gradient_step(recipe: Recipe, spec: str) -> float:
+    """Measure a gradient step of this recipe, with its share of environment steps, on a model made for it."""
+    settings = dataclasses.replace(recipe.sac, learning_starts=0)
+    cycle = settings.cycle()[0] * settings.envs
+    model = _make_sac(dataclasses.replace(recipe, sac=settings), spec, (WARM_UP + PROBE_CYCLES) * cycle)
+    model.learn(WARM_UP * cycle, log_interval=sys.maxsize)
+    start, first = time.monotonic(), model.num_timesteps
+    while time.monotonic() - start < PROBE and model.num_timesteps < (WARM_UP + PROBE_CYCLES) * cycle:
+        model.learn(cycle, reset_num_timesteps=False, log_interval=sys.maxsize)
+    done = _work(settings, model.num_timesteps) - _work(settings, first)
+    assert model.env is not None
+    model.env.close()
+    return (time.monotonic() - start) / done
+
+
+def _make_sac(recipe: Recipe, spec: str, buffer_size: int) -> SAC:
     settings = recipe.sac
-    turn, gradient_steps = settings.cycle()
+    cycle, gradient_steps = settings.cycle()
 
     def single() -> gym.Env[Any, Any]:
         # float32 halves the replay buffer; the medium-replay level keeps exactly what SAC saw
@@ -140,36 +165,113 @@ def _make_sac(recipe: Recipe, spec: str, steps: int) -> SAC:
             warnings.simplefilter("ignore", UserWarning)  # Gymnasium's remark on the bounds' precision
             return gym.wrappers.DtypeObservation(make_env(spec), np.float32)
 
-    return SAC(
+    model = SAC(
         "MlpPolicy",
         DummyVecEnv([single] * settings.envs),
         learning_rate=settings.learning_rate,
-        buffer_size=steps + settings.segment,
+        buffer_size=buffer_size,
         learning_starts=settings.learning_starts,
         batch_size=settings.batch_size,
         tau=settings.tau,
         gamma=settings.discount,
-        train_freq=turn,
+        train_freq=cycle,
         gradient_steps=gradient_steps,
         policy_kwargs={"net_arch": list(settings.hidden), "optimizer_kwargs": {"fused": True}},
-        seed=0,  # replaced below: every segment seeds its own generators
+        seed=0,  # replaced: every segment seeds its own generators
         device="cpu",
     )
+    model.set_logger(Logger(folder=None, output_formats=[]))  # SB3's own makes a folder in /tmp
+    return model
 
 
-def _learn_segment(model: SAC, settings: Any, seed: int, step: int) -> None:
-    """Train from `step` to the next rung, on fresh episodes and from generators of this segment's own."""
-    index = step // settings.segment
+def _start_or_resume(folder: TrainingFolder, model: SAC) -> float:
+    """Load the newest checkpoint, or new weights of the training's seed; return the seconds trained so far."""
+    seconds = restore(folder, model, lambda step: _start_segment(folder, model, step))
+    if not model.num_timesteps:
+        set_random_seed(seeds.integer(folder.seed, Purpose.WEIGHTS, 0) % 2**32)
+        policy_class: Any = model.policy_class
+        model.policy = policy_class(
+            model.observation_space, model.action_space, model.lr_schedule, **model.policy_kwargs
+        ).to(model.device)
+        model._create_aliases()
+    return seconds
+
+
+def _start_segment(folder: TrainingFolder, model: SAC, step: int) -> None:
+    """Seed everything for the segment that holds `step`; the next `learn` starts on fresh episodes."""
+    index = step // folder.recipe.sac.segment
     # SB3 draws from the global generators of NumPy and PyTorch: seed them for this segment
-    set_random_seed(seeds.integer(seed, Purpose.SAC, index) % 2**32)
-    model.action_space.seed(seeds.integer(seed, Purpose.SAC, index, 1) % 2**32)
+    set_random_seed(seeds.integer(folder.seed, Purpose.SAC, index) % 2**32)
+    model.action_space.seed(seeds.integer(folder.seed, Purpose.SAC, index, 1) % 2**32)
     assert model.env is not None
-    model.env.seed(seeds.integer(seed, Purpose.SAC, index, 2) % 2**31)
+    model.env.seed(seeds.integer(folder.seed, Purpose.SAC, index, 2) % 2**31)
     model._last_obs = None  # makes learn() reset the environments
-    fraction = min(step / settings.steps, 1.0)
+
+
+def _train_segment(folder: TrainingFolder, model: SAC, progress: Progress, stops: Sequence[int]) -> bool:
+    """Train to the end of the segment; return False if Ctrl-C or SIGTERM came before."""
+    settings = folder.recipe.sac
+    start = model.num_timesteps // settings.segment * settings.segment
+    end, cycle = start + settings.segment, settings.cycle()[0] * settings.envs
+    keep_every = max(settings.segment // cycle // POLICIES, 1) * cycle
+    if model.num_timesteps == start:
+        _start_segment(folder, model, start)
+    fraction = min(start / settings.steps, 1.0)
     rate = settings.learning_rate + fraction * (settings.final_learning_rate - settings.learning_rate)
     model.lr_schedule = lambda _: rate
-    model.learn(settings.segment, reset_num_timesteps=False, log_interval=sys.maxsize)  # no log lines
+    while model.num_timesteps < end:
+        if stops:
+            return False
+        model.learn(cycle, reset_num_timesteps=False, log_interval=sys.maxsize)
+        step = model.num_timesteps
+        if settings.learning_starts < step < end and (step - start) % keep_every == 0:
+            _export(folder, model).save(folder.policy(step))
+        progress.to(step, work=_work(settings, step))
+    return True
+
+
+def _end_segment(
+    folder: TrainingFolder, model: SAC, rollouts: Rollouts, rows: Sequence[dict[str, float]], seconds: float
+) -> dict[str, float]:
+    """Screen the rung at the end of a segment and write what the segment made; return its row of rungs.csv.
+
+    The checkpoint comes last, and with it the segment counts.
+    """
+    step, segment = model.num_timesteps, folder.recipe.sac.segment
+    policy = _export(folder, model)
+    row = {"step": step, "hours": round(seconds / 3600, 4)} | _screen(folder, rollouts, policy, step)
+    returns = [before["stochastic_return"] for before in (*rows, row)]
+    with disk_errors(str(folder.path)):
+        policy.save(folder.policy(step))
+        if len(returns) > 1 and abs(returns[-1] - returns[-2]) < FAR_APART * (max(returns) - min(returns)):
+            for other in folder.policy_steps():
+                if step - segment < other < step:
+                    folder.policy(other).unlink()
+        path = folder.transitions(step)
+        path.parent.mkdir(exist_ok=True)
+        temporary = path.with_name("." + path.name)
+        arrays: dict[str, Any] = transitions_since(model, step - segment)
+        np.savez(temporary, **arrays)
+        temporary.replace(path)
+        write_bytes(folder.rungs, csv_bytes(SCREENED, ([values[key] for key in SCREENED] for values in (*rows, row))))
+        save_segment_end(folder, model, seconds)
+    return row
+
+
+def _screen(folder: TrainingFolder, rollouts: Rollouts, policy: Policy, step: int) -> dict[str, float]:
+    """Measure a rung over a few episodes: enough to choose candidates, not to publish."""
+    episodes = folder.recipe.sac.rung_episodes
+    row: dict[str, float] = {"episodes": episodes}
+    for how, deterministic in (("stochastic", False), ("deterministic", True)):
+        stream = (int(Purpose.RUNG), step, int(deterministic))
+        outcomes = rollouts.outcomes(policy, folder.seed, stream, episodes, deterministic).result()
+        row |= summary(outcomes, f"{how}_")
+    return row
+
+
+def _export(folder: TrainingFolder, model: SAC) -> Policy:
+    origin = {"algorithm": "SAC", "step": model.num_timesteps, "seed": folder.seed}
+    return export_actor(model, folder.recipe.env_id, origin)
 
 
 def export_actor(model: SAC, env_id: str, origin: dict[str, Any]) -> Policy:
@@ -187,132 +289,3 @@ def export_actor(model: SAC, env_id: str, origin: dict[str, Any]) -> Policy:
 
 def _array(tensor: torch.Tensor) -> Array:
     return tensor.detach().cpu().numpy().copy()
-
-
-def _screen(rollouts: Rollouts, policy: Policy, seed: int, step: int, episodes: int) -> dict[str, float]:
-    """Measure a rung over a few episodes: enough to choose candidates, not to publish."""
-    row: dict[str, float] = {}
-    for how, deterministic in (("stochastic", False), ("deterministic", True)):
-        stream = (int(Purpose.RUNG), step, int(deterministic))
-        outcomes = rollouts.outcomes(policy, seed, stream, episodes, deterministic).result()
-        row |= summary(outcomes, f"{how}_")
-    return row | {"episodes": episodes}
-
-
-def _save_segment(
-    training: Training, model: SAC, policy: Policy, rows: list[dict[str, float]], seconds: float
-) -> None:
-    """Write what a segment made; the checkpoint comes last, and with it the segment counts."""
-    step = int(rows[-1]["step"])
-    with disk_errors(str(training.folder)):
-        policy.save(training.policy(step))
-        path = training.transitions(step)
-        path.parent.mkdir(exist_ok=True)
-        aside = path.with_name("." + path.name)
-        arrays: dict[str, Any] = _segment_arrays(model, training.recipe.sac.segment)
-        np.savez(aside, **arrays)
-        aside.replace(path)
-        write_bytes(training.rungs, csv_bytes(SCREENED, ([row[key] for key in SCREENED] for row in rows)))
-        state = {"step": step, "n_updates": model._n_updates, "seconds": seconds}
-        save_checkpoint(training.folder, step, _sac_tensors(model), state)
-        keep_newest(training.folder)
-
-
-def _segment_arrays(model: SAC, segment: int) -> dict[str, Array]:
-    """Return the newest `segment` transitions of the replay buffer, [steps, envs, ...]; actions in [-1, 1]."""
-    buffer = model.replay_buffer
-    assert buffer is not None
-    rows = slice(buffer.pos - segment // buffer.n_envs, buffer.pos)
-    names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-    return {name: getattr(buffer, name)[rows] for name in names}
-
-
-def _sac_tensors(model: SAC) -> dict[str, torch.Tensor]:
-    """Return weights, temperature and optimiser moments by name."""
-    tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
-    tensors["log_ent_coef"] = _temperature(model).detach()
-    for name in OPTIMISERS:
-        state = _optimiser(model, name).state_dict()["state"]
-        tensors |= {f"{name}.{i}.{key}": value for i, part in state.items() for key, value in part.items()}
-    return tensors
-
-
-def _temperature(model: SAC) -> torch.Tensor:
-    assert model.log_ent_coef is not None  # SB3 learns it unless told otherwise
-    return model.log_ent_coef
-
-
-def _optimiser(model: SAC, name: str) -> torch.optim.Optimizer:
-    owner: Any = model
-    for part in name.split("."):
-        owner = getattr(owner, part)
-    assert isinstance(owner, torch.optim.Optimizer)
-    return owner
-
-
-def _resume(training: Training, model: SAC) -> tuple[int, float]:
-    """Put the newest checkpoint and the replay buffer back into `model`; return its step and seconds."""
-    found = load_newest(training.folder)
-    model._setup_learn(0, None)  # gives the model its logger and callbacks before the first segment
-    if found is None:
-        set_random_seed(seeds.integer(training.seed, Purpose.WEIGHTS, 0) % 2**32)
-        _reset_weights(model)
-        return 0, 0.0
-    tensors, state = found
-    weights = {k.removeprefix("policy."): v for k, v in tensors.items() if k.startswith("policy.")}
-    model.policy.load_state_dict(weights)
-    _temperature(model).data.copy_(tensors["log_ent_coef"])
-    for name in OPTIMISERS:
-        _load_optimiser(_optimiser(model, name), name, tensors)
-    _refill(training, model, int(state["step"]))
-    model.num_timesteps, model._n_updates = int(state["step"]), int(state["n_updates"])
-    return model.num_timesteps, float(state["seconds"])
-
-
-def _reset_weights(model: SAC) -> None:
-    """Build the networks anew, from the generator seeded just before."""
-    made: Any = model.policy_class
-    model.policy = made(model.observation_space, model.action_space, model.lr_schedule, **model.policy_kwargs)
-    model.policy = model.policy.to(model.device)
-    model._create_aliases()
-
-
-def _load_optimiser(optimiser: torch.optim.Optimizer, name: str, tensors: dict[str, torch.Tensor]) -> None:
-    whole = optimiser.state_dict()
-    moments: dict[int, dict[str, torch.Tensor]] = {}
-    for key, value in tensors.items():
-        if key.startswith(name + "."):
-            index, moment = key.removeprefix(name + ".").split(".")
-            moments.setdefault(int(index), {})[moment] = value
-    optimiser.load_state_dict({"state": moments, "param_groups": whole["param_groups"]})
-
-
-def _refill(training: Training, model: SAC, step: int) -> None:
-    """Put every recorded transition back into the replay buffer, in its old order."""
-    buffer = model.replay_buffer
-    assert buffer is not None
-    segment = training.recipe.sac.segment
-    position = 0
-    for end in range(segment, step + 1, segment):
-        path = training.transitions(end)
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                count = len(arrays["rewards"])
-                for name in arrays.files:
-                    getattr(buffer, name)[position : position + count] = arrays[name]
-        except (OSError, ValueError, KeyError) as error:
-            raise OffbenchError(
-                f"{path} is missing or damaged ({error}); delete {training.folder} to train anew"
-            ) from None
-        position += count
-    buffer.pos = position
-
-
-def read_rungs(path: Path) -> list[dict[str, float]]:
-    """Read rungs.csv (an empty list if there is none yet)."""
-    if not path.exists():
-        return []
-    lines = path.read_text().splitlines()
-    header = lines[0].split(",")
-    rows = [dict(zip(header, map(float, line.split(",")), strict=True)) for line in lines[1:]]
-    return [row | {"step": int(row["step"]), "episodes": int(row["episodes"])} for row in rows]

@@ -8,66 +8,113 @@ from typing import Any
 
 import pytest
 
-from offbench.agents.build_ladder import Surveyor
+from offbench.agents.build_ladder import RungEvaluator
 from offbench.agents.ladder import Ladder, Rung, read_ladder
 from offbench.common.errors import OffbenchError
 from offbench.data.levels import Part, parse_level, parse_mix, shares
 
 
-def surveyor(returns: list[float], spread: float = 5.0) -> Surveyor:
-    """Rungs whose measured return is known; screening says the same with an interval of +- spread."""
+def evaluator(
+    returns: list[float], within: dict[int, float] | None = None, spread: float = 5.0
+) -> tuple[RungEvaluator, list[int]]:
+    """Rungs at steps 10, 20, ... of known return; screening says the same with an interval of +- spread.
+
+    Args:
+        returns: of the rungs.
+        within: returns of policies within segments, by step.
+
+    Returns:
+        The evaluator, and the steps that it measures, as it does.
+    """
     rows: list[dict[str, float]] = [
         {"step": 10 * (i + 1), "stochastic_return": value, "stochastic_high": value + spread}
         for i, value in enumerate(returns)
     ]
-    found = Surveyor(SimpleNamespace(), rows, SimpleNamespace())  # type: ignore[arg-type]
+    true = {int(row["step"]): row["stochastic_return"] for row in rows} | (within or {})
+    rungs = RungEvaluator(SimpleNamespace(), rows, sorted(true), SimpleNamespace())  # type: ignore[arg-type]
+    measured: list[int] = []
 
     def measure(step: int) -> float:
-        found.measured[step] = {"return": returns[step // 10 - 1]}
-        return returns[step // 10 - 1]
+        if step not in rungs.measured:
+            measured.append(step)
+        rungs.measured[step] = {"return": true[step]}
+        return true[step]
 
-    found.measure = measure  # type: ignore[method-assign]
-    return found
+    rungs.measure = measure  # type: ignore[method-assign]
+    return rungs, measured
 
 
 def test_medium_is_the_first_rung_in_its_band() -> None:
-    assert surveyor([0, 10, 50, 40, 36, 100]).medium(100 / 3, 45, 60) == 40
+    rungs, _ = evaluator([0, 10, 50, 40, 36, 100])
+    assert rungs.medium(100 / 3, 45, 60) == 40
 
 
 def test_without_a_rung_in_the_band_medium_is_the_nearest() -> None:
-    assert surveyor([0, 20, 70, 100]).medium(100 / 3, 45, 40) == 20
-    assert surveyor([0, 1, 50, 100]).medium(100 / 3, 45, 40) == 30
+    assert evaluator([0, 20, 70, 100])[0].medium(100 / 3, 45, 40) == 20
+    assert evaluator([0, 1, 50, 100])[0].medium(100 / 3, 45, 40) == 30
 
 
 def test_medium_comes_before_the_expert() -> None:
-    assert surveyor([0, 20, 100, 40]).medium(100 / 3, 45, 30) == 20
+    assert evaluator([0, 20, 100, 40])[0].medium(100 / 3, 45, 30) == 20
 
 
 def test_rungs_that_cannot_be_medium_are_not_measured() -> None:
-    found = surveyor([0, 0, 0, 40, 100])
-    found.medium(100 / 3, 45, 50)
-    assert set(found.measured) == {40}
+    rungs, measured = evaluator([0, 0, 0, 40, 100])
+    rungs.medium(100 / 3, 45, 50)
+    assert measured == [40]
+
+
+def test_where_the_return_leaps_over_the_band_medium_is_a_policy_within_the_segment() -> None:
+    """Between the rungs of steps 20 and 30 the return passes the band at step 26; halving gets there by 25, 28, 27."""
+    within = dict(zip(range(21, 30), [11.0, 12, 13, 15, 20, 40, 60, 70, 90], strict=True))
+    rungs, measured = evaluator([0, 10, 95, 40, 100], within)
+    assert rungs.medium(100 / 3, 45, 50) == 26
+    assert measured == [30, 25, 28, 27, 26]
+
+
+def test_without_a_policy_in_the_band_within_the_segment_the_search_continues() -> None:
+    rungs, _ = evaluator([0, 10, 95, 40, 100], {25: 70.0})
+    assert rungs.medium(100 / 3, 45, 50) == 40
+    rungs, _ = evaluator([0, 10, 95, 98, 100], {25: 55.0})
+    assert rungs.medium(100 / 3, 45, 50) == 25, "nearer to the band than any rung"
+
+
+def test_a_return_that_the_rungs_leap_over_is_found_within_a_segment() -> None:
+    """Both where the return rises and where it falls."""
+    within = {22: 30.0, 25: 50.0, 27: 61.0}
+    rungs, _ = evaluator([0, 10, 95, 98], within)
+    assert rungs.nearest(60, close=2.5) == 27
+    rungs, _ = evaluator([0, 98, 10, 5], within | {22: 70.0, 25: 50.0, 27: 61.0})
+    assert rungs.nearest(50, close=2.5) == 25
+    rungs, _ = evaluator([70, 80, 90], {2: 5.0, 4: 12.0, 7: 50.0})
+    assert rungs.nearest(10, close=2.5) == 4, "before the first rung"
+
+
+def test_the_nearest_of_some_rungs_is_not_one_after_them() -> None:
+    rungs, _ = evaluator([0, 10, 95, 33, 100], {25: 70.0, 33: 31.0})
+    rungs.measure(33)
+    assert rungs.nearest(33, 1, among=[10, 20]) == 20
 
 
 def test_the_expert_is_the_best_of_the_late_rungs() -> None:
-    assert surveyor([500, 10, 20, 90, 80]).expert() == 40
+    assert evaluator([500, 10, 20, 90, 80])[0].expert() == 40
 
 
 def test_the_nearest_rung_is_nearest_as_measured_not_as_screened() -> None:
     """Screening promised 50 at step 20 and 30; measured, they return 90 and 10, and 48 is the better choice."""
-    found = surveyor([0, 90, 10, 48, 100])
+    rungs, measured = evaluator([0, 90, 10, 48, 100])
     for step, lucky in ((20, 50.0), (30, 51.0), (40, 46.0)):
-        found.screened[step]["stochastic_return"] = lucky
-    assert found.nearest(50, close=5) == 40
-    assert set(found.measured) == {20, 30, 40}
+        rungs.screened[step]["stochastic_return"] = lucky
+    assert rungs.nearest(50, close=5) == 40
+    assert set(measured) == {20, 30, 40}
 
 
 def test_looking_for_the_nearest_rung_ends() -> None:
-    found = surveyor([100.0] * 20)
-    for row in found.screened.values():
+    rungs, measured = evaluator([100.0] * 20)
+    for row in rungs.screened.values():
         row["stochastic_return"] = 50.0
-    found.nearest(50, close=5)
-    assert len(found.measured) == 6
+    rungs.nearest(50, close=5)
+    assert len(measured) == 6
 
 
 def test_the_nearest_rung_of_a_ladder() -> None:

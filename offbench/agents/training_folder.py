@@ -1,0 +1,54 @@
+"""The folder of a behaviour agent's training: plain files, read without PyTorch.
+
+training.json               recipe, seed, versions and hardware
+rungs.csv                   the screening returns of every rung
+policies/<step>.safetensors the policy of every rung, and policies within segments
+transitions/<step>.npz      the transitions of the segment that ended at <step>
+checkpoint-<step>.safetensors
+ladder/                     what `build_ladder` chose (unless `--out` says otherwise)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from offbench.common.files import damage, read_text
+from offbench.envs.recipes import Recipe
+
+
+@dataclass(frozen=True)
+class TrainingFolder:
+    """Where the training of one recipe and seed keeps its files."""
+
+    recipe: Recipe
+    seed: int
+    path: Path
+
+    @property
+    def rungs(self) -> Path:
+        """The screening returns of every rung."""
+        return self.path / "rungs.csv"
+
+    def policy(self, step: int) -> Path:
+        """The policy after `step` environment steps."""
+        return self.path / "policies" / f"{step:09d}.safetensors"
+
+    def policy_steps(self) -> list[int]:
+        """Return the steps whose policy was kept, in order, those within segments included."""
+        return sorted(int(path.stem) for path in (self.path / "policies").glob("*.safetensors") if path.stem.isdigit())
+
+    def transitions(self, step: int) -> Path:
+        """The transitions of the segment that ended at `step`."""
+        return self.path / "transitions" / f"{step:09d}.npz"
+
+
+def read_rungs(path: Path) -> list[dict[str, float]]:
+    """Read rungs.csv (an empty list if there is none yet). Raises OffbenchError if it is damaged."""
+    if not path.exists():
+        return []
+    with damage(f"{path} is damaged", "delete its folder to train the agent again"):
+        lines = read_text(path).splitlines()
+        header = lines[0].split(",")
+        rows = [dict(zip(header, map(float, line.split(",")), strict=True)) for line in lines[1:]]
+        return [row | {"step": int(row["step"]), "episodes": int(row["episodes"])} for row in rows]
