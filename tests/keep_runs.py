@@ -9,7 +9,6 @@ import shutil
 import sys
 from pathlib import Path
 
-from offbench.training.grouping import finished
 from offbench.training.run import find_runs
 
 FILES = ("config.json", "evaluations.csv", "losses.csv")
@@ -19,7 +18,7 @@ def keep(runs: Path, place: Path) -> list[Path]:
     """Copy each finished run's files below `place`; return the runs' folders there."""
     kept = []
     for run in find_runs(runs):
-        if finished(run, run.config()["steps"]):
+        if run.finished(run.config().steps):
             folder = place / run.folder.relative_to(runs)
             folder.mkdir(parents=True, exist_ok=True)
             for name in FILES:

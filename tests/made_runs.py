@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from offbench.common.files import write_json
-from offbench.training.run import Run, run_folder
+from offbench.training.run import Run, RunConfig
+from offbench.training.spec import run_folder
 
 COMMAND = "offbench train {algorithm} --dataset {dataset} --seeds 0:{seeds} --steps {steps}"
 
@@ -32,7 +33,7 @@ def made_run(
     run = Run(run_folder(root, dataset, algorithm, variant, seed))
     run.folder.mkdir(parents=True)
     every = steps // 12
-    config = {
+    config: dict[str, Any] = {
         "format": "offbench-run-1",
         "algorithm": algorithm,
         "variant": variant,
@@ -50,7 +51,7 @@ def made_run(
         "versions": {"python": "3.11.7", "offbench": "0.1.0", "mujoco": "3.4.0", "torch": "2.13.0"},
         "hardware": {"processor": "a processor", "cores": 2, "machine": "x86_64"},
     }
-    run.claim(config)
+    run.claim(RunConfig(**config))
     rng = np.random.default_rng([seed, sum(f"{dataset}{algorithm}{variant}".encode())])
     level += float(rng.normal(0, noise))
     stop = steps if reached is None else reached

@@ -14,7 +14,7 @@ from offbench.analysis.statistics import Estimate, Paired, improvement, paired
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.text import counted
 from offbench.training.registry import algorithm_names
-from offbench.training.run import folder_name
+from offbench.training.spec import folder_name
 
 LEVEL = 0.05  # a difference is evidence below this p, if its interval leaves out 0 too
 

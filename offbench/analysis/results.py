@@ -24,7 +24,7 @@ from offbench.common.scores import mean_std, normalize, run_return, window
 from offbench.common.text import counted, printable
 from offbench.data.levels import LEVELS
 from offbench.training.registry import FORMER_SETTINGS
-from offbench.training.run import DIGITS, Run, find_runs
+from offbench.training.run import DIGITS, Run, RunConfig, find_runs
 
 # the order of the BDB paper's Table 1; levels are in its order already
 ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
@@ -94,13 +94,13 @@ class Trained:
     """One run and what has been evaluated of it."""
 
     run: Run
-    config: Mapping[str, Any]
+    config: RunConfig
     evaluations: Mapping[int, Sequence[tuple[float, int]]]
 
     @property
     def seed(self) -> int:
         """The run's seed."""
-        return int(self.config["seed"])
+        return self.config.seed
 
     @property
     def window(self) -> tuple[int, ...]:
@@ -115,7 +115,7 @@ class Trained:
     @property
     def steps(self) -> int:
         """How far the run is to go."""
-        return int(self.config["steps"])
+        return self.config.steps
 
     @property
     def state(self) -> str:
@@ -134,7 +134,8 @@ class Trained:
         return {step: self._normalized(mean, reference) for step, mean in means.items()}
 
     def _normalized(self, value: float, reference: str | None) -> float:
-        return value if reference is None else normalize(value, *self.config["references"][reference])
+        references = self.config.references.get(reference) if reference else None
+        return normalize(value, *references) if references else value
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ class Entry:
 
     def mean_std(self, reference: str | None) -> tuple[float, float | None] | None:
         """Return mean and deviation over seeds by a reference; None if a run lacks it."""
-        if reference is not None and not all(t.config["references"].get(reference) for t in self.runs):
+        if reference is not None and not all(t.config.references.get(reference) for t in self.runs):
             return None
         return mean_std([trained.score(reference) for trained in self.runs])
 
@@ -254,7 +255,7 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
             damaged.append(error)
             continue
         if evaluations:
-            key = (config["dataset"], config["dataset_sha256"], config["algorithm"], config["variant"])
+            key = (config.dataset, config.dataset_sha256, config.algorithm, config.variant)
             groups.setdefault(key, []).append(Trained(run, config, evaluations))
         else:
             waiting.append(run)
@@ -267,7 +268,7 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
     for (dataset, content, algorithm, variant), group in groups.items():
         group.sort(key=lambda trained: trained.seed)
         _check_seeds(group)
-        method = Method(algorithm, variant, _beta(group[0].config["settings"].get("beta")))
+        method = Method(algorithm, variant, _beta(group[0].config.settings.get("beta")))
         entries.append(Entry(tasks[dataset, content], method, tuple(group)))
     entries.sort(key=lambda entry: (_task_order(entry.task), _method_order(entry.method)))
     return entries, waiting
@@ -287,7 +288,7 @@ def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[Trained]]) -> dic
     ids = [dataset for dataset, _ in runs]
     found = {}
     for (dataset, content), group in runs.items():
-        known = [name for name in ("dataset", "d4rl") if all(t.config["references"].get(name) for t in group)]
+        known = [name for name in ("dataset", "d4rl") if all(t.config.references.get(name) for t in group)]
         found[dataset, content] = Task(dataset, content, known[0] if known else None, ids.count(dataset) > 1)
     return found
 

@@ -1,26 +1,25 @@
-"""`benchmark`: a whole grid, from missing datasets to the score table; stopped at any point, it goes on.
+"""`benchmark`: a whole grid, from missing datasets to the score table; it resumes wherever it was stopped.
 
-grid -> plan: runs, stacks, expected hours, disk (offbench.benchmarks.plan)
-     -> datasets that are missing are recorded
-     -> a shard's runs -> cut into parts -> what is left of them -> jobs -> an executor
+grid -> plan: runs, expected hours, disk (offbench.benchmarks.plan)
+     -> missing datasets are recorded
+     -> a shard's runs -> Training (offbench.training.train) -> an executor
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
 from offbench.benchmarks.datasets import record_source
-from offbench.benchmarks.grid import Source, Times
+from offbench.benchmarks.grid import Source
 from offbench.benchmarks.plan import Benchmark, Plan, prepare
 from offbench.common.errors import OffbenchError
-from offbench.training.grouping import Part, cut, diverged, pending, with_evaluators
-from offbench.training.jobs import Job, Order, complain, run_jobs
-from offbench.training.trainer import Schedule
+from offbench.training.jobs import raise_first, run_jobs
+from offbench.training.spec import Job, RunSpec
+from offbench.training.train import Training
 
 UNITS = {"s": 1, "m": 60, "h": 3600}
 
@@ -29,11 +28,11 @@ class Executor(Protocol):
     """Where recordings and trainings happen."""
 
     def record(self, sources: Sequence[Source], workers: int) -> None:
-        """Record datasets. Raises OffbenchError if one cannot be."""
+        """Record datasets. Raises OffbenchError if one cannot be recorded."""
         ...
 
     def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
-        """Train jobs as far as their deadline; return what went wrong, a line each."""
+        """Train jobs up to their deadline; return what went wrong, a line each."""
         ...
 
 
@@ -50,7 +49,7 @@ class LocalExecutor:
                 record_source(source, workers)
 
     def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
-        """Train jobs in so many processes."""
+        """Train jobs, up to `processes` at a time."""
         return run_jobs(jobs, processes)
 
 
@@ -63,15 +62,14 @@ def benchmark(
     command: str = "",
     say: Callable[[str], None] = print,
 ) -> bool:
-    """Run a grid to its end, or as far as the budget allows; finished parts are left alone.
+    """Run a grid to its end, or as far as the budget allows; finished runs are left as they are.
 
     Args:
         grid: a shipped grid's name such as `medium`, a file (`./mine.toml`), or what
             `offbench.benchmarks.plan.prepare` returns, which takes the folder, the device and the processes.
-        budget: "9m", "2h" or "90s": stops cleanly after that time; the same call goes on.
+        budget: "9m", "2h" or "90s": stops with checkpoints after that time; the same call resumes.
         shard: (i, n): the i-th of n shares of the runs, for machines with a shared file system.
-        executor: where it happens: this machine (default), or a cluster
-            (`offbench.benchmarks.ray_executor.RayExecutor`).
+        executor: this machine (default), or a cluster (`offbench.benchmarks.ray_executor.RayExecutor`).
         command: what the user typed, for each run's config.json.
         say: takes the plan, line by line.
 
@@ -79,7 +77,7 @@ def benchmark(
         Whether the grid (of this shard) is finished.
 
     Raises:
-        OffbenchError: anything that the user can mend; runs that diverged, once all others are done.
+        OffbenchError: anything that the user can fix; runs that diverged, once all others are done.
     """
     deadline = time.time() + _seconds(budget) if budget else None
     executor = executor or LocalExecutor(deadline)
@@ -87,22 +85,14 @@ def benchmark(
     plan = Plan(bench)
     for line in plan:
         say(line)
-    executor.record(bench.missing(), bench.workers)
+    executor.record(bench.missing(), bench.machine.workers)
     if bench.missing():
         return False  # out of time
-    parts = _parts(bench, shard)
-    jobs = [
-        replace(job, cost=plan.update_seconds.get(job.kind, 1.0))
-        for part, schedule in parts
-        for job in pending(part, replace(schedule, deadline=deadline), command=command)
-    ]
-    jobs.sort(key=lambda job: job.work, reverse=True)  # a long one begun last would run beside idle ones
-    if bench.device != "cpu":
-        jobs = with_evaluators(jobs, bench.workers)
-    for line in diverged([part for part, _ in parts]):  # known since an earlier call, which failed for it
+    training = Training(shard_of(bench, shard), bench.machine, command=command)
+    for line in training.diverged:  # in an earlier call, which raised for it
         say(line)
-    complain(executor.train(jobs, bench.processes) if jobs else [])
-    return not any(pending(part, schedule, command=command) for part, schedule in parts)
+    raise_first(training.run(executor.train, deadline=deadline, cost=plan.update_seconds))
+    return not training.pending()
 
 
 def _seconds(text: str) -> float:
@@ -116,33 +106,19 @@ def _seconds(text: str) -> float:
     return value
 
 
-def _parts(bench: Benchmark, shard: tuple[int, int]) -> list[tuple[Part, Schedule]]:
-    """Return this shard's parts. Runs of equal times are cut together, whatever their algorithm."""
-    by_times: dict[Times, list[Order]] = {}
-    for one, orders in zip(bench.variants, shared(bench, shard), strict=True):
-        by_times.setdefault(replace(one.times, seeds=()), []).extend(orders)
-    found = []
-    for times, orders in by_times.items():
-        schedule = Schedule(
-            times.steps, times.eval_every, times.eval_episodes, bench.device, workers=0, precision=bench.precision
-        )
-        found += [(part, schedule) for part in cut(orders, bench.device, bench.processes, bench.stack)]
-    return found
-
-
-def shared(bench: Benchmark, shard: tuple[int, int]) -> list[list[Order]]:
-    """Return a shard's runs of each variant: of each its share, by the grid alone, for machines differ.
+def shard_of(bench: Benchmark, shard: tuple[int, int]) -> list[RunSpec]:
+    """Return a shard's runs: a share of each variant, by the grid alone, as the machines may differ.
 
     Raises:
         OffbenchError: there is no such shard.
     """
-    place, count = shard
-    if not 0 <= place < count:
-        raise OffbenchError(f"a shard is i/n with i from 0 to n - 1, not {place}/{count}")
-    found, first = [], 0
-    for one in bench.variants:
-        orders = bench.orders(one)
-        mine = np.array_split(np.arange(len(orders)), count)[(place - first) % count]
-        found.append([orders[i] for i in mine])
-        first += len(orders)  # the first few have one more: next time the shares behind them
-    return found
+    index, count = shard
+    if not 0 <= index < count:
+        raise OffbenchError(f"a shard is i/n with i from 0 to n - 1, not {index}/{count}")
+    specs: list[RunSpec] = []
+    offset = 0
+    for variant in bench.variants:
+        share = np.array_split(np.arange(len(variant)), count)[(index - offset) % count]
+        specs += [variant[i] for i in share]
+        offset += len(variant)  # the first few shares have one run more: for the next variant, those after them
+    return specs

@@ -21,10 +21,11 @@ from typing import Any
 
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import damage, read_text
-from offbench.common.settings import build, setting
+from offbench.common.settings import build
 from offbench.data import minari_store
 from offbench.data.levels import parse_level
 from offbench.envs.recipes import load_recipe
+from offbench.training.spec import Times
 
 MOST_SEEDS = 100_000  # beyond this a count is a slip, and would fill the memory
 
@@ -43,16 +44,6 @@ class Source:
     level: str = ""
     steps: int | None = None
     seed: int = 0
-
-
-@dataclass(frozen=True)
-class Times:
-    """How long runs train."""
-
-    seeds: tuple[int, ...] = (0,)
-    steps: int = setting(1_000_000, "updates", low=1)
-    eval_every: int = setting(5_000, "updates between evaluations", low=1)
-    eval_episodes: int = setting(10, "episodes of an evaluation", low=1)
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,12 @@
 """A Ray cluster as the executor of a benchmark: `offbench benchmark GRID --executor ray`.
 
-    driver (head)   plans, deals out stacks and recordings as tasks, holds the run directories
-    task            trains one stack for at most a slice of time, then hands it back; the driver deals it out again
-    Shelf           an actor beside the driver: reads and writes files there for nodes that do not share its disk
+    driver (head)   plans, submits jobs and recordings as tasks, holds the run folders
+    task            trains one job for at most a slice of time and returns; the driver submits what is left of it again
+    FileServer      an actor on the driver's node: reads and writes files there for nodes that do not share its disk
 
-A node whose disk holds the driver's token works in place. Any other fetches datasets and checkpoints from the shelf,
-trains in a folder of its own and puts the run directories back. A lost node costs what it had not handed back: Ray
-runs its tasks again, and a run's bits do not depend on where it goes on.
+A node that can read the driver's token on its own disk works in the driver's folders. Any other node downloads the
+datasets and checkpoints from the file server, trains in a folder of its own and uploads the run folders. A lost node
+costs what it had not uploaded: Ray runs its tasks again, and a run's bits do not depend on where it resumes.
 """
 
 from __future__ import annotations
@@ -28,15 +28,14 @@ from offbench.benchmarks.grid import Source
 from offbench.common.errors import OffbenchError
 from offbench.common.files import write_bytes
 from offbench.data import minari_store
-from offbench.training.grouping import finished
-from offbench.training.jobs import Board, Job, Order, is_over, perform
-from offbench.training.run import Run
+from offbench.training.jobs import JobProgress, is_over, raise_first, train_job
+from offbench.training.spec import Job, RunSpec
 
-SLICE = 600.0  # seconds that a task trains before it hands back
+SLICE = 600.0  # seconds that a task trains before it returns
 RETRIES = 5  # times that Ray runs a lost task again
-REACH = 5.0  # seconds to wait for a cluster
-LOOK = 1.0  # seconds between two looks at the tasks
-LEFT_OUT = (".lock", ".holder", ".tmp")  # endings of files that mean something to one process alone
+TIMEOUT = 5.0  # seconds to wait for a cluster
+POLL = 1.0  # seconds between two checks of the tasks
+LEFT_OUT = (".lock", ".holder", ".tmp")  # endings of files that belong to one process
 
 Files = dict[str, bytes]
 
@@ -60,7 +59,7 @@ class RayExecutor:
         self.slice = slice_seconds
         if not ray.is_initialized():
             try:
-                _reach(address)
+                _check_address(address)
                 ray.init(address=address, log_to_driver=False, include_dashboard=False)
             except (OSError, RuntimeError, ValueError, SystemExit) as error:
                 raise OffbenchError(
@@ -68,9 +67,9 @@ class RayExecutor:
                 ) from None
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
-        self.shelf = ray.remote(num_cpus=0, scheduling_strategy=here)(Shelf).remote()
-        self._retried = {"max_retries": RETRIES, "num_cpus": 1}
+        this_node = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+        self.server = ray.remote(num_cpus=0, scheduling_strategy=this_node)(FileServer).remote()
+        self._options = {"max_retries": RETRIES, "num_cpus": 1}
 
     @property
     def cpus(self) -> int:
@@ -79,100 +78,89 @@ class RayExecutor:
 
     def record(self, sources: Sequence[Source], workers: int) -> None:
         """Record datasets, a task each. Raises OffbenchError for the first that failed."""
-        task = self.ray.remote(**self._retried)(_record)
+        task = self.ray.remote(**self._options)(_record)
         with _token(minari_store.root()) as token:
-            found = self.ray.get([task.remote(s, str(minari_store.root()), token, self.shelf) for s in sources])
-        for _, lines in found:
-            for line in lines:
-                raise OffbenchError(line)
+            results = self.ray.get([task.remote(s, str(minari_store.root()), token, self.server) for s in sources])
+        raise_first([line for _, lines in results for line in lines])
 
     def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
-        """Train jobs, slice by slice, wherever there is room; return what went wrong, a line each."""
-        jobs = [replace(job, orders=tuple(_absolute(order) for order in job.orders)) for job in jobs]
-        where = Path(os.path.commonpath([order.folder for job in jobs for order in job.orders]))
+        """Train jobs, slice by slice, wherever a processor is free; return what went wrong, a line each."""
+        jobs = [replace(job, specs=tuple(replace(s, folder=s.folder.resolve()) for s in job.specs)) for job in jobs]
+        common = Path(os.path.commonpath([spec.folder for job in jobs for spec in job.specs]))
         waiting, active, problems = list(range(len(jobs))), dict[Any, int](), list[str]()
-        with Board(jobs) as board, _token(where) as token:
+        with JobProgress(jobs) as progress, _token(common) as token:
             while waiting or active:
-                for place in waiting:
-                    if not is_over(jobs[place]):
-                        active[self._start(jobs[place], place, token)] = place
+                for index in waiting:
+                    if not is_over(jobs[index]):
+                        active[self._start(jobs[index], index, token)] = index
                 waiting = []
-                for ref in self.ray.wait(list(active), num_returns=1, timeout=LOOK)[0] if active else ():
-                    place = active.pop(ref)
-                    well, lines = self._result(ref, jobs[place])
+                for ref in self.ray.wait(list(active), num_returns=1, timeout=POLL)[0] if active else ():
+                    index = active.pop(ref)
+                    succeeded, lines = self._result(ref, jobs[index])
                     problems += lines
-                    if well and left(jobs[place]):
-                        waiting.append(place)
-                for place, (step, note) in self.ray.get(self.shelf.reports.remote()).items():
-                    board.at(place, step, note)
+                    if succeeded and unfinished(jobs[index]):
+                        waiting.append(index)
+                for index, (step, note) in self.ray.get(self.server.reports.remote()).items():
+                    progress.update(index, step, note)
         return problems
 
-    def _start(self, job: Job, place: int, token: str) -> Any:
-        gpu = {"num_gpus": 1} if job.schedule.device != "cpu" else {}
-        task = self.ray.remote(**self._retried, **gpu)(_train)
-        rest = replace(job, orders=left(job))
-        return task.remote(rest, self.slice, place, str(minari_store.root().resolve()), token, self.shelf)
+    def _start(self, job: Job, index: int, token: str) -> Any:
+        gpu = {"num_gpus": 1} if job.device != "cpu" else {}
+        task = self.ray.remote(**self._options, **gpu)(_train)
+        rest = replace(job, specs=unfinished(job))
+        return task.remote(rest, self.slice, index, str(minari_store.root().resolve()), token, self.server)
 
     def _result(self, ref: Any, job: Job) -> tuple[bool, list[str]]:
         try:
-            found: tuple[bool, list[str]] = self.ray.get(ref)
-            return found
+            result: tuple[bool, list[str]] = self.ray.get(ref)
+            return result
         except self.ray.exceptions.RayError as error:
             reason = str(error).strip().splitlines()[-1]
             return False, [f"{job.title}: its node was lost {RETRIES} times, or its process died: {reason}"]
 
 
-def _reach(address: str | None) -> None:
+def _check_address(address: str | None) -> None:
     """Raise OSError if nothing listens at an address: Ray itself would try for minutes, then end the process."""
     host, _, port = (address or "").removeprefix("ray://").rpartition(":")
     if host and port.isdigit():
-        socket.create_connection((host, int(port)), timeout=REACH).close()
+        socket.create_connection((host, int(port)), timeout=TIMEOUT).close()
 
 
-def _absolute(order: Order) -> Order:
-    return replace(order, folder=str(Path(order.folder).resolve()))
+def unfinished(job: Job) -> tuple[RunSpec, ...]:
+    """Return the runs of a job that have neither reached their last step nor diverged."""
+    return tuple(spec for spec in job.specs if not (spec.run.diverged or spec.run.finished(spec.steps)))
 
 
-def left(job: Job) -> tuple[Order, ...]:
-    """Return the runs of a job that have neither come to their last step nor diverged."""
-
-    def over(order: Order) -> bool:
-        run = Run(Path(order.folder))
-        return run.diverged or finished(run, job.schedule.steps)
-
-    return tuple(order for order in job.orders if not over(order))
-
-
-class Shelf:
-    """The driver's files, for nodes that do not share its disk; and what the tasks report."""
+class FileServer:
+    """The driver's files, for nodes that do not share its disk, and the tasks' progress."""
 
     def __init__(self) -> None:
-        self.at: dict[int, tuple[int, str]] = {}
+        self.latest: dict[int, tuple[int, str]] = {}
 
     def read(self, folder: str) -> Files:
         """Return all files of a folder."""
         return read_folder(Path(folder))
 
     def write(self, folder: str, files: Files) -> None:
-        """Bring a folder of runs up to date: newer files in, deleted ones out; each file whole."""
+        """Make a run folder hold these files; each is written whole."""
         write_folder(Path(folder), files)
 
     def replace(self, folder: str, files: Files) -> None:
-        """Put a dataset's folder in its place, whole."""
+        """Write a dataset's folder, whole or not at all."""
         target = Path(folder)
-        aside = target.with_name(f".offbench-{target.name}.shelf")
+        aside = target.with_name(f".offbench-{target.name}.upload")
         shutil.rmtree(aside, ignore_errors=True)
         write_folder(aside, files)
         if not target.exists():
             aside.replace(target)
 
-    def report(self, place: int, step: int, note: str) -> None:
-        """Take in how far a job is."""
-        self.at[place] = (step, note)
+    def report(self, index: int, step: int, note: str) -> None:
+        """Keep the latest step and note of a job."""
+        self.latest[index] = (step, note)
 
     def reports(self) -> dict[int, tuple[int, str]]:
-        """Return how far every job is."""
-        return dict(self.at)
+        """Return the latest step and note of every job."""
+        return dict(self.latest)
 
 
 def read_folder(folder: Path) -> Files:
@@ -191,7 +179,7 @@ def write_folder(folder: Path, files: Files) -> None:
 
 @contextmanager
 def _token(folder: Path) -> Iterator[str]:
-    """Write a file whose content tells a node whether it sees the driver's disk."""
+    """Write a file that a node can read if it shares the driver's disk."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f".offbench-token-{os.getpid()}"
     content = os.urandom(16).hex()
@@ -211,8 +199,8 @@ def _shared(token: str) -> bool:
 
 
 @contextmanager
-def _elsewhere() -> Iterator[Path]:
-    """A folder of this task alone, with Minari's datasets and our cache in it."""
+def _own_folder() -> Iterator[Path]:
+    """Yield a folder of this task alone, which Minari's datasets and the cache are in too."""
     with tempfile.TemporaryDirectory(prefix="offbench-") as name:
         old = {key: os.environ.get(key) for key in ("MINARI_DATASETS_PATH", "OFFBENCH_CACHE")}
         os.environ |= {"MINARI_DATASETS_PATH": f"{name}/minari", "OFFBENCH_CACHE": f"{name}/cache"}
@@ -230,58 +218,58 @@ def _restore(environment: dict[str, str | None]) -> None:
             os.environ[key] = value
 
 
-def _train(job: Job, seconds: float, place: int, datasets: str, token: str, shelf: Any) -> tuple[bool, list[str]]:
-    """A task: train a stack until its slice ends, which begins here: however long it has waited, it goes on."""
-    ends = [end for end in (job.schedule.deadline, time.time() + seconds) if end is not None]
-    job = replace(job, schedule=replace(job.schedule, deadline=min(ends)))
+def _train(job: Job, seconds: float, index: int, datasets: str, token: str, server: Any) -> tuple[bool, list[str]]:
+    """A task: train a job for a slice of time, which begins now, however long the task has waited."""
+    slice_end = time.time() + seconds
+    job = replace(job, deadline=slice_end if job.deadline is None else min(job.deadline, slice_end))
 
     def report(step: int, note: str) -> None:
-        shelf.report.remote(place, step, note)
+        server.report.remote(index, step, note)
 
-    return _task(lambda: _train_there(job, datasets, token, shelf, report), job.title)
+    return _task(lambda: _train_here(job, datasets, token, server, report), job.title)
 
 
-def _train_there(job: Job, datasets: str, token: str, shelf: Any, report: Callable[[int, str], None]) -> list[str]:
+def _train_here(job: Job, datasets: str, token: str, server: Any, report: Callable[[int, str], None]) -> list[str]:
     import ray
 
     if _shared(token):
         os.environ["MINARI_DATASETS_PATH"] = datasets
-        return perform(job, report)
-    with _elsewhere() as here:
-        for name in {order.dataset for order in job.orders}:
-            write_folder(minari_store.path_of(name), ray.get(shelf.read.remote(f"{datasets}/{name}")))
-        own = tuple(replace(order, folder=str(here / str(i))) for i, order in enumerate(job.orders))
-        for order, local in zip(job.orders, own, strict=True):
-            write_folder(Path(local.folder), ray.get(shelf.read.remote(order.folder)))
-        lines = perform(replace(job, orders=own), report)
-        for order, local in zip(job.orders, own, strict=True):
-            ray.get(shelf.write.remote(order.folder, read_folder(Path(local.folder))))
+        return train_job(job, report)
+    with _own_folder() as folder:
+        for name in {spec.dataset for spec in job.specs}:
+            write_folder(minari_store.path_of(name), ray.get(server.read.remote(f"{datasets}/{name}")))
+        own = tuple(replace(spec, folder=folder / str(i)) for i, spec in enumerate(job.specs))
+        for spec, local in zip(job.specs, own, strict=True):
+            write_folder(local.folder, ray.get(server.read.remote(str(spec.folder))))
+        lines = train_job(replace(job, specs=own), report)
+        for spec, local in zip(job.specs, own, strict=True):
+            ray.get(server.write.remote(str(spec.folder), read_folder(local.folder)))
         return lines
 
 
-def _record(source: Source, datasets: str, token: str, shelf: Any) -> tuple[bool, list[str]]:
+def _record(source: Source, datasets: str, token: str, server: Any) -> tuple[bool, list[str]]:
     """A task: record a dataset."""
-    return _task(lambda: _record_there(source, datasets, token, shelf), source.id)
+    return _task(lambda: _record_here(source, datasets, token, server), source.id)
 
 
-def _record_there(source: Source, datasets: str, token: str, shelf: Any) -> list[str]:
+def _record_here(source: Source, datasets: str, token: str, server: Any) -> list[str]:
     import ray
 
     if _shared(token):
         os.environ["MINARI_DATASETS_PATH"] = datasets
         record_source(source, workers=1)
         return []
-    with _elsewhere():
+    with _own_folder():
         record_source(source, workers=1)
-        ray.get(shelf.replace.remote(f"{datasets}/{source.id}", read_folder(minari_store.path_of(source.id))))
+        ray.get(server.replace.remote(f"{datasets}/{source.id}", read_folder(minari_store.path_of(source.id))))
     return []
 
 
 def _task(work: Callable[[], list[str]], title: str) -> tuple[bool, list[str]]:
-    """Return whether the work can go on, and what went wrong."""
+    """Return whether the task succeeded, and what went wrong."""
     try:
         return True, work()
     except OffbenchError as error:
         return False, [f"{title}: {error}"]
-    except Exception:  # a fault of ours or of a third party's algorithm: the driver shows it whole
+    except Exception:  # a bug of offbench or of a third party's algorithm: the driver shows all of it
         return False, [f"{title}: {traceback.format_exc()}"]

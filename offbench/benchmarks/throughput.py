@@ -1,25 +1,26 @@
-"""What training costs here: a moment of each algorithm on made-up data, and of the environment."""
+"""What training costs here: half a second of each algorithm on random data, and of the environment."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from offbench.algorithm.interface import Algorithm
 from offbench.algorithm.mlp import products_by
 from offbench.data.transitions import Transitions
 from offbench.envs.environments import make_env
-from offbench.training.batches import Member
 from offbench.training.devices import arithmetic, stack_size
 from offbench.training.registry import load_algorithm
-from offbench.training.run import Run
+from offbench.training.spec import RunSpec
 from offbench.training.stack import RECORDED, Stack
 
 SECONDS = 0.5  # that a measurement lasts at least
-ROWS = 4096  # made-up transitions
+ROWS = 4096  # random transitions
 ENV_STEPS = 2000
 COUNTED = 4  # updates whose operations are counted: of every kind that takes turns
 
@@ -39,18 +40,15 @@ class Rate:
     bytes_per_run: int
 
 
-def measure(
-    algorithm: str, config: Any, spec: str, device: str, *, precision: str = "float32", stack: int = 0
-) -> Rate:
-    """Time an algorithm's updates on made-up data of an environment's shapes, for half a second or more.
+def measure(spec: RunSpec, env_spec: str, device: str, *, stack: int = 0) -> Rate:
+    """Time the updates of runs like `spec` on random data of an environment's shapes, for half a second or more.
 
     Args:
         stack: runs together; 0 for one on a CPU and for what fits on a GPU.
     """
-    kind, member = load_algorithm(algorithm), made_up(algorithm, config, spec)
-    with arithmetic(device, precision):
-        runs = stack or (1 if device == "cpu" else stack_size(kind, member, device))
-        learning = Stack(kind, [member] * runs, device)
+    with arithmetic(device, spec.precision):
+        runs = stack or (1 if device == "cpu" else stack_size(spec, random_data(env_spec), device))
+        learning = random_stack(load_algorithm(spec.algorithm), [spec.config] * runs, env_spec, device)
         wanted = 2 * RECORDED
         while True:
             began, first = time.perf_counter(), learning.step
@@ -65,11 +63,11 @@ def measure(
     return Rate(wanted * runs / spent, runs, size)
 
 
-def operations(algorithm: str, config: Any, spec: str) -> float:
+def operations(spec: RunSpec, env_spec: str) -> float:
     """Return the floating-point operations of an update's matrix products, as PyTorch counts them (2 m n k each)."""
     from torch.utils.flop_counter import FlopCounterMode
 
-    learning = Stack(load_algorithm(algorithm), [made_up(algorithm, config, spec)], "cpu")
+    learning = random_stack(load_algorithm(spec.algorithm), [spec.config], env_spec)
     learning.program.eager = True
     for _ in learning.train(2 * RECORDED):  # past whatever happens only once
         pass
@@ -79,29 +77,39 @@ def operations(algorithm: str, config: Any, spec: str) -> float:
     return float(counter.get_total_flops()) / COUNTED
 
 
-def made_up(algorithm: str, config: Any, spec: str) -> Member:
-    """Return a run on random numbers of an environment's shapes."""
-    env = make_env(spec)
+def random_stack(
+    kind: type[Algorithm], configs: Sequence[Any], env_spec: str, device: str = "cpu", *, rows: int = ROWS
+) -> Stack:
+    """Return a stack of runs with seeds 0, 1, ... on the same random data of an environment's shapes."""
+    specs = [
+        RunSpec("", config, "random", seed, steps=1, eval_every=1, eval_episodes=1, folder=Path())
+        for seed, config in enumerate(configs)
+    ]
+    return Stack(kind, specs, {"random": random_data(env_spec, rows)}, device)
+
+
+def random_data(env_spec: str, rows: int = ROWS) -> Transitions:
+    """Return random transitions of an environment's shapes."""
+    env = make_env(env_spec)
     space: Any = env.action_space
     shape = env.observation_space.shape
     env.close()
     assert shape is not None
     rng = np.random.default_rng(0)
-    data = Transitions(
-        "calibration",
+    return Transitions(
+        "random",
         "",
-        rng.standard_normal((ROWS + 1, *shape)).astype(np.float32),
-        np.arange(ROWS),
-        rng.uniform(-1, 1, (ROWS, *space.shape)).astype(np.float32),
-        rng.standard_normal(ROWS).astype(np.float32),
-        np.ones(ROWS, np.float32),
-        np.array([ROWS]),
+        rng.standard_normal((rows + 1, *shape)).astype(np.float32),
+        np.arange(rows),
+        rng.uniform(-1, 1, (rows, *space.shape)).astype(np.float32),
+        rng.standard_normal(rows).astype(np.float32),
+        np.ones(rows, np.float32),
+        np.array([rows]),
         np.zeros(1),
         space.low,
         space.high,
-        {"env_spec": spec},
+        {"env_spec": env_spec},
     )
-    return Member(Run(Path()), 0, config, data, algorithm)
 
 
 def step_seconds(spec: str) -> float:

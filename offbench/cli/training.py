@@ -129,7 +129,7 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
             arguments["workers"] = arguments["workers"] or where.cpus
         bench = prepare(**arguments)
         finished = benchmark(bench, budget=budget, shard=shard, executor=where, command=command)
-        if rows := normalize.score_some(bench.begun()):  # a small budget ends before there are any
+        if rows := normalize.score_some(bench.started()):  # a small budget ends before there are any
             print(normalize.render(rows))
         if not finished:
             print("stopped at the budget; the same command goes on", file=sys.stderr)

@@ -1,6 +1,7 @@
-"""Settings as frozen dataclasses: defaults, help, ranges and types live in one place, the field itself.
+"""Settings and metadata as frozen dataclasses: defaults, help, ranges and types live in one place, the field itself.
 
-Recipes (TOML), algorithm configs (CLI flags, config.json) and checks all read the same fields.
+build       a recipe (TOML), a grid (TOML) or an algorithm's settings (CLI flags, config.json) to a settings object
+read_back   metadata that offbench wrote as JSON (a run's config.json) to a dataclass
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import re
 import types
 import typing
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 from offbench.common.errors import OffbenchError, unknown
@@ -58,30 +60,64 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
         where: what the mapping is, for the error line.
 
     Raises:
-        OffbenchError: an unknown key (the nearest known one is named), a wrong type or a value out of range.
+        OffbenchError: an unknown key (the nearest valid one is named), a missing one, a wrong type or a value out of
+            range.
     """
-    known = fields(cls)
+    valid = fields(cls)
     for key in values:
-        if key not in known:
-            raise OffbenchError(f"{where}: {unknown('key', key, known)}")
-    checked = {key: check(cls, key, value, where) for key, value in values.items()}
-    missing = [
-        name
-        for name, f in known.items()
-        if name not in checked and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-    ]
-    if missing:
-        raise OffbenchError(f"{where}: missing key {missing[0]!r}")
-    return cls(**checked)
+        if key not in valid:
+            raise OffbenchError(f"{where}: {unknown('key', key, valid)}")
+    return cls(**_checked(cls, values, where, parse=True))
 
 
-def check(cls: type, name: str, value: Any, where: str) -> Any:
-    """Return `value` as the type of the field `name`, or raise OffbenchError naming `where`."""
+def read_back(cls: type[T], values: Any, file: Path | str, remedy: str) -> T:
+    """Make a metadata object from parsed JSON, as another version of offbench may have written it.
+
+    Types are strict (text is no number), and keys that `cls` does not have are ignored. A field may be a dataclass or
+    a list of them (`tuple[cls, ...]`).
+
+    Args:
+        file, remedy: for the error line: where the JSON is from, and what to do about it.
+
+    Raises:
+        OffbenchError: not a JSON object, a missing key, a wrong type or a value out of range.
+    """
+    try:
+        return _from_json(cls, values)
+    except (OffbenchError, ValueError) as error:
+        raise OffbenchError(f"{file} is damaged ({error}); {remedy}") from None
+
+
+def _from_json(cls: type[T], values: Any) -> T:
+    if not isinstance(values, dict):
+        raise ValueError(f"must be a JSON object, not {_shown(values)}")
+    return cls(**_checked(cls, {key: values[key] for key in fields(cls) if key in values}, "", parse=False))
+
+
+def _checked(cls: type, values: Mapping[str, Any], where: str, parse: bool) -> dict[str, Any]:
+    checked = {key: check(cls, key, value, where, parse=parse) for key, value in values.items()}
+    for name, field in fields(cls).items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and name not in checked:
+            raise _error(where, f"missing key {name!r}")
+    return checked
+
+
+def _error(where: str, text: str) -> OffbenchError:
+    return OffbenchError(f"{where}: {text}" if where else text)
+
+
+def check(cls: type, name: str, value: Any, where: str, *, parse: bool = True) -> Any:
+    """Return `value` as the type of the field `name`. Raises OffbenchError, which begins with `where`.
+
+    Args:
+        parse: whether text may stand for a number, a list and so on, as on a command line.
+    """
     hint = typing.get_type_hints(cls)[name]
     try:
-        value = _convert(value, hint)
+        value = _convert(value, hint, parse)
     except (TypeError, ValueError, OverflowError):
-        raise OffbenchError(f"{where}: {name} must be {_describe(hint)}, not {_shown(value)}") from None
+        raise _error(where, f"{name} must be {_describe(hint)}, not {_shown(value)}") from None
     metadata = fields(cls)[name].metadata
     numbers = value if isinstance(value, tuple) else (value,)
     for number in numbers:
@@ -100,20 +136,20 @@ def _shown(value: Any) -> str:
 def _check_range(name: str, value: Any, metadata: Mapping[str, Any], where: str) -> None:
     choices = metadata.get("choices")
     if isinstance(value, str) and choices and value not in choices:
-        raise OffbenchError(f"{where}: {name} must be one of {', '.join(choices)}, not {value!r}")
+        raise _error(where, f"{name} must be one of {', '.join(choices)}, not {value!r}")
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
     if isinstance(value, int) and abs(value) >= 2**63:
-        raise OffbenchError(f"{where}: {name} is too large a number")
+        raise _error(where, f"{name} is too large a number")
     low, above, high = metadata.get("low"), metadata.get("above"), metadata.get("high")
     if not math.isfinite(value):
-        raise OffbenchError(f"{where}: {name} must be a finite number, not {value}")
+        raise _error(where, f"{name} must be a finite number, not {value}")
     if low is not None and value < low:
-        raise OffbenchError(f"{where}: {name} must be at least {low:g}, not {value:g}")
+        raise _error(where, f"{name} must be at least {low:g}, not {value:g}")
     if above is not None and value <= above:
-        raise OffbenchError(f"{where}: {name} must be more than {above:g}, not {value:g}")
+        raise _error(where, f"{name} must be more than {above:g}, not {value:g}")
     if high is not None and value > high:
-        raise OffbenchError(f"{where}: {name} must be at most {high:g}, not {value:g}")
+        raise _error(where, f"{name} must be at most {high:g}, not {value:g}")
 
 
 def _options(hint: Any) -> tuple[Any, ...]:
@@ -123,29 +159,39 @@ def _options(hint: Any) -> tuple[Any, ...]:
     return (hint,)
 
 
-def _convert(value: Any, hint: Any) -> Any:
-    """Return `value` as `hint`; text (from a command line) is parsed. Raises TypeError or ValueError."""
+def _convert(value: Any, hint: Any, parse: bool) -> Any:
+    """Return `value` as `hint`. Raises TypeError, ValueError, or OffbenchError from a dataclass in it."""
     errors = []
     for option in _options(hint):
         try:
-            return _convert_one(value, option)
+            return _convert_one(value, option, parse)
         except (TypeError, ValueError) as error:
             errors.append(error)
     raise errors[0]
 
 
-def _convert_one(value: Any, option: Any) -> Any:
+def _convert_one(value: Any, option: Any, parse: bool) -> Any:
+    if option is Any:
+        return value
     if typing.get_origin(option) is tuple:
-        item = typing.get_args(option)[0]
-        parts = re.split("[,x]", value) if isinstance(value, str) else value  # 64x64 as folders are named
+        items = typing.get_args(option)
+        parts = re.split("[,x]", value) if isinstance(value, str) and parse else value  # 64x64 as folders are named
         if not isinstance(parts, list | tuple):
             raise TypeError
-        return tuple(_convert_one(part, item) for part in parts)
-    if option in _FROM_TEXT and isinstance(value, str):
+        if items[-1] is Ellipsis:
+            items = items[:1] * len(parts)
+        return tuple(_convert(part, item, parse) for part, item in zip(parts, items, strict=True))
+    if typing.get_origin(option) is dict:
+        if not isinstance(value, dict):
+            raise TypeError
+        return {key: _convert(item, typing.get_args(option)[1], parse) for key, item in value.items()}
+    if dataclasses.is_dataclass(option) and isinstance(value, dict) and not parse:
+        return _from_json(option, value)  # type: ignore[arg-type]
+    if option in _FROM_TEXT and isinstance(value, str) and parse:
         return _FROM_TEXT[option](value)
     if option is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if option is int and isinstance(value, float) and value.is_integer():
+    if option is int and isinstance(value, float) and value.is_integer() and parse:
         return int(value)
     if type(value) is not option and not (dataclasses.is_dataclass(option) and isinstance(value, option)):  # type: ignore[arg-type]
         raise TypeError
@@ -184,5 +230,5 @@ def _describe(hint: Any) -> str:
                 "a list of whole numbers like 256,256 or 256x256" if int in typing.get_args(option) else "a list"
             )
         else:
-            parts.append(_WORDS.get(option, str(option)))
+            parts.append(_WORDS.get(option, "a table"))
     return " or ".join(parts)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from offbench.envs.recipes import d4rl_constants, load_recipe
 from offbench.envs.trust import REMEDY, is_trusting
 from offbench.rollouts.policy import Policy, load_policy
 from offbench.rollouts.rollouts import Rollouts, result
-from offbench.training.run import Run
+from offbench.training.run import Run, RunConfig
 
 
 @dataclass(frozen=True)
@@ -91,9 +90,11 @@ def evaluate(
     returns = [outcome.ret for outcome in outcomes]
     played = json.loads(spec)["id"]
     # a run's own references hold for its own environment alone
-    known = config.get("references") if same_environment(config.get("env_spec"), spec) else None
-    known = known or {"dataset": shipped_references(spec), "d4rl": d4rl_constants(played)}
-    scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in known.items() if pair}
+    if config is not None and same_environment(config.env_spec, spec):
+        references = config.references
+    else:
+        references = {"dataset": shipped_references(spec), "d4rl": d4rl_constants(played)}
+    scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in references.items() if pair}
     physics = f" with contact margins as in MuJoCo {SINCE[ADDED]}" if without_margin(spec)[1] == ADDED else ""
     return Evaluation(str(path), played, returns, [o.length for o in outcomes], scores, physics)
 
@@ -129,7 +130,7 @@ def similarity(
     stack = restore(run)
     critic = stack.algorithm.learned.get("critic")
     if not isinstance(critic, Network):
-        raise OffbenchError(f"{path}: {run.config()['algorithm']} has no critic to compare by")
+        raise OffbenchError(f"{path}: {run.config().algorithm} has no critic to compare by")
     rng = generator(seed, Purpose.SAMPLE)
     batch = stack.store.batch(torch.from_numpy(rng.integers(stack.store.sizes[0], size=(1, samples))))
     policy = stack.policy(0)
@@ -170,8 +171,8 @@ def _registered(env_id: str, path: Path) -> str:
     return name
 
 
-def open_policy(path: Path, env: str | None = None) -> tuple[Policy, Mapping[str, Any], str]:
-    """Return the policy of a run's directory or a policy file, the run's config ({} for a file) and its EnvSpec.
+def open_policy(path: Path, env: str | None = None) -> tuple[Policy, RunConfig | None, str]:
+    """Return the policy of a run's folder or a policy file, the run's config (None for a file) and its EnvSpec.
 
     Args:
         env: a recipe's name or file, instead of the environment that the run or policy names.
@@ -179,7 +180,7 @@ def open_policy(path: Path, env: str | None = None) -> tuple[Policy, Mapping[str
     Raises:
         OffbenchError: no run or policy there, or it does not fit the environment.
     """
-    config: Mapping[str, Any] = {}
+    config = None
     if path.is_dir():
         run = Run(path)
         config = run.config()
@@ -190,8 +191,8 @@ def open_policy(path: Path, env: str | None = None) -> tuple[Policy, Mapping[str
         policy = load_policy(path)
     if env is not None:
         text = load_recipe(env).env_spec()
-    elif isinstance(config.get("env_spec"), str):
-        text = config["env_spec"]
+    elif config is not None and config.env_spec is not None:
+        text = config.env_spec
     elif policy.env_id:
         text = env_spec(_registered(policy.env_id, path))
     else:

@@ -26,7 +26,7 @@ def dataset_table(results: Results) -> Table:
     rows = []
     for task in results.tasks:
         runs = [trained for (found, _), entry in results.entries.items() if found == task for trained in entry.runs]
-        envs = sorted({str(trained.config.get("env_id") or "") for trained in runs} - {""})
+        envs = sorted({trained.config.env_id for trained in runs} - {""})
         rows.append(
             [
                 Cell(task.dataset),
@@ -47,7 +47,7 @@ def dataset_table(results: Results) -> Table:
 
 def _scale(trained: Trained) -> str:
     """Return a run's references in words, "" if its dataset has none."""
-    pair = trained.config["references"].get("dataset")
+    pair = trained.config.references.get("dataset")
     return f"{pair[0]:,.1f} to {pair[1]:,.1f}" if pair else ""
 
 

@@ -7,7 +7,6 @@ import hashlib
 import importlib.resources
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from offbench.analysis.results import REFERENCES, Entry, Results
 from offbench.common.scores import run_return
@@ -15,7 +14,7 @@ from offbench.common.tables import Cell, Table
 from offbench.reports.figures import Figure, Line
 from offbench.reports.markup import Markup, breakable, join, prose, tag
 from offbench.reports.tables import cell_id
-from offbench.training.run import Run, sessions
+from offbench.training.run import Run, Session
 
 
 @dataclass(frozen=True)
@@ -143,19 +142,17 @@ def boxes(results: Results) -> list[Markup]:
 
 def _box(results: Results, entry: Entry, name: str) -> Markup:
     task, first = entry.task, entry.runs[0].config
-    commands = dict.fromkeys(str(trained.config.get("command") or "from Python") for trained in entry.runs)
-    references = [
-        f"{REFERENCES[key]}: {pair[0]:g} to {pair[1]:g}" for key, pair in first["references"].items() if pair
-    ]
-    parts = [part for trained in entry.runs for part in sessions(trained.config)]
+    commands = dict.fromkeys(trained.config.command or "from Python" for trained in entry.runs)
+    references = [f"{REFERENCES[key]}: {pair[0]:g} to {pair[1]:g}" for key, pair in first.references.items() if pair]
+    sessions = [session for trained in entry.runs for session in trained.config.history]
     facts = {
         "dataset": f"{task.dataset}, content {task.content}",
         "references": "; ".join(references) or "none",
-        "evaluation": f"every {first.get('eval_every', 0):,} updates, {first.get('eval_episodes', 0)} episodes",
+        "evaluation": f"every {first.eval_every:,} updates, {first.eval_episodes} episodes",
         "commands": "\n".join(commands),
-        "versions": _several([_words(part.get("versions")) for part in parts]),
-        "hardware": _several([_hardware(part) for part in parts]),
-        "settings": ", ".join(f"{key} {value}" for key, value in first["settings"].items()) or "none",
+        "versions": _several([_words(session.versions) for session in sessions]),
+        "hardware": _several([_hardware(session) for session in sessions]),
+        "settings": ", ".join(f"{key} {value}" for key, value in first.settings.items()) or "none",
     }
     title = f"{entry.method.label} on {task.name}"
     terms = [part for key, text in facts.items() for part in (tag("dt", key), tag("dd", breakable(text)))]
@@ -201,9 +198,8 @@ def _words(found: object) -> str:
     return ", ".join(f"{key} {value}" for key, value in found.items()) if isinstance(found, Mapping) else "unknown"
 
 
-def _hardware(part: Mapping[str, Any]) -> str:
-    precision = part.get("precision", "tf32" if part.get("tf32") else "float32")
-    return f"{part.get('device', 'unknown device')}, {precision}; {_words(part.get('hardware'))}"
+def _hardware(session: Session) -> str:
+    return f"{session.device or 'unknown device'}, {session.precision}; {_words(session.hardware)}"
 
 
 def _several(texts: Sequence[str]) -> str:

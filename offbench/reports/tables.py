@@ -6,7 +6,6 @@ import csv
 import dataclasses
 import importlib.resources
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from offbench.analysis.compare import comparable, differences, favoured, partners
 from offbench.analysis.results import REFERENCES, Entry, Method, Results, Task, window_words
@@ -14,7 +13,7 @@ from offbench.analysis.statistics import Estimate, Scores, improvement, iqm, pai
 from offbench.common.scores import LAST, mean_std
 from offbench.common.tables import Cell, Table
 from offbench.common.text import counted
-from offbench.training.run import DIGITS
+from offbench.training.run import DIGITS, RunConfig
 
 PAPER = "BDB paper, Table 1"
 NONE = Cell("-")
@@ -156,7 +155,7 @@ def _torn(entries: Sequence[Entry]) -> list[str]:
     for entry in entries:
         for trained in entry.runs:
             if entry.task.reference == "dataset":
-                scales.setdefault(entry.task.place[0], set()).add(tuple(trained.config["references"]["dataset"]))
+                scales.setdefault(entry.task.place[0], set()).add(trained.config.references["dataset"] or ())
     return sorted(env for env, pairs in scales.items() if len(pairs) > 1)
 
 
@@ -292,23 +291,23 @@ def seed_table(results: Results) -> Table:
             )
     for run in results.waiting:
         config = run.config()
-        words = [_waiting_name(results, config), f"{config['algorithm']} {config['variant']}".removesuffix(" default")]
+        words = [_waiting_name(results, config), f"{config.algorithm} {config.variant}".removesuffix(" default")]
         numbers = [
-            Cell(str(config["seed"])),
+            Cell(str(config.seed)),
             NONE,
             NONE,
             NONE,
             Cell("0", 0),
             Cell("0", 0),
-            Cell(f"{config['steps']:,}"),
+            Cell(f"{config.steps:,}"),
         ]
         rows.append([*map(Cell, words), *numbers, Cell("diverged" if run.diverged else "not evaluated yet")])
     header = ["dataset", "method", "seed", "score", "return", "reference", "evaluations", "step", "of", "state"]
     return Table("seeds", "Every run", header, rows, [], 3)
 
 
-def _waiting_name(results: Results, config: Mapping[str, Any]) -> str:
+def _waiting_name(results: Results, config: RunConfig) -> str:
     """Return a dataset's id, with its content's first digits where the id alone is ambiguous."""
-    contents = {task.content for task in results.tasks if task.dataset == config["dataset"]}
-    twin = bool(contents) and contents != {config["dataset_sha256"]}
-    return Task(config["dataset"], config["dataset_sha256"], None, twin).name
+    contents = {task.content for task in results.tasks if task.dataset == config.dataset}
+    twin = bool(contents) and contents != {config.dataset_sha256}
+    return Task(config.dataset, config.dataset_sha256, None, twin).name

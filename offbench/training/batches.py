@@ -9,8 +9,7 @@ in a stack, and a resume needs no generator state.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,40 +21,31 @@ from offbench.common import seeds
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import Purpose
 from offbench.data.transitions import Transitions
-from offbench.training.run import Run
+from offbench.training.spec import RunSpec
 
 CHUNK = 100  # updates whose random numbers are drawn together; part of what a seed means, never change
 
 
-@dataclass(frozen=True)
-class Member:
-    """One run of a stack.
-
-    Attributes:
-        algorithm: its name in the registry.
-    """
-
-    run: Run
-    seed: int
-    config: Any
-    data: Transitions
-    algorithm: str
-
-
 class Store:
-    """The transitions of all runs' datasets on the device, end to end, and where each run's begin."""
+    """The transitions of all runs' datasets on the device, end to end, and where each run's begin.
+
+    Args:
+        specs: the runs.
+        datasets: by the names that `specs` give them.
+    """
 
     def __init__(
         self,
-        members: Sequence[Member],
+        specs: Sequence[RunSpec],
+        datasets: Mapping[str, Transitions],
         normalize_observations: bool,
         device: torch.device,
         next_actions: bool = False,
     ) -> None:
-        distinct = {member.data.dataset_id: member.data for member in members}
         starts, count, row = {}, 0, 0
         parts: dict[str, list[Tensor]] = {k: [] for k in ("observations", "rows", "actions", "rewards", "masks")}
-        for name, data in distinct.items():
+        used = {spec.dataset: datasets[spec.dataset] for spec in specs}
+        for name, data in used.items():
             starts[name] = count
             for key, tensors in parts.items():
                 array = getattr(data, key)
@@ -64,19 +54,20 @@ class Store:
         whole = {key: (t[0] if len(t) == 1 else torch.cat(t)).to(device) for key, t in parts.items()}
         self.observations, self.rows = whole["observations"], whole["rows"]
         self.actions, self.rewards, self.masks = whole["actions"], whole["rewards"], whole["masks"]
-        self.sizes = [len(member.data) for member in members]
-        first = [starts[member.data.dataset_id] for member in members]
+        self.sizes = [len(used[spec.dataset]) for spec in specs]
+        first = [starts[spec.dataset] for spec in specs]
         self.chosen: Tensor | None = None  # where runs train on a part: the transitions of each, end to end
-        if any(getattr(member.config, "top", 1.0) < 1 for member in members):
-            chosen = [m.data.best(getattr(m.config, "top", 1.0)) + f for m, f in zip(members, first, strict=True)]
+        shares = [getattr(spec.config, "top", 1.0) for spec in specs]
+        if min(shares) < 1:
+            chosen = [used[spec.dataset].best(top) + f for spec, top, f in zip(specs, shares, first, strict=True)]
             self.sizes = [len(part) for part in chosen]
-            first = [sum(self.sizes[:i]) for i in range(len(members))]
+            first = [sum(self.sizes[:i]) for i in range(len(specs))]
             self.chosen = torch.from_numpy(np.concatenate(chosen)).to(device)
         self.first = torch.tensor(first, device=device).view(-1, 1)
-        known = {name: data.normalizer() for name, data in distinct.items()} if normalize_observations else {}
         dim = self.observations.shape[1]
         identity = (np.zeros(dim, np.float32), np.ones(dim, np.float32))
-        self.normalizers = [known.get(member.data.dataset_id, identity) for member in members]
+        normalizers = {name: data.normalizer() if normalize_observations else identity for name, data in used.items()}
+        self.normalizers = [normalizers[spec.dataset] for spec in specs]  # (mean, std) of each run
         self.mean = torch.from_numpy(np.stack([mean for mean, _ in self.normalizers])).to(device).unsqueeze(1)
         self.std = torch.from_numpy(np.stack([std for _, std in self.normalizers])).to(device).unsqueeze(1)
         self.normalize = normalize_observations

@@ -1,25 +1,65 @@
-"""The device that a stack trains on: which, with what precision, and how many runs it holds."""
+"""The machine that runs train on: its device, its processes, the precision and the size of a stack."""
 
 from __future__ import annotations
 
 import gc
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 import threadpoolctl
 import torch
 
-from offbench.algorithm.interface import Algorithm
 from offbench.algorithm.mlp import products_by
 from offbench.common.errors import OffbenchError
+from offbench.common.processes import default_workers
 from offbench.common.provenance import has_bfloat16
-from offbench.training.batches import Member
+from offbench.data.transitions import Transitions
+from offbench.training.registry import load_algorithm
+from offbench.training.spec import RunSpec
 from offbench.training.stack import WARM_UP, Stack
 
-CPU_STACK = 8  # runs of one process: more gain nothing there, and each waits for all
+CPU_STACK = 8  # runs of one process: more runs gain nothing there, and each waits for all of them
 PRECISIONS = ("float32", "tf32", "bfloat16")
 MEMORY_SHARE = 0.8  # of a GPU's free memory that a stack may take
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where runs train.
+
+    Attributes:
+        device: PyTorch's name: cpu, cuda or cuda:N.
+        workers: processes.
+        stack: the most runs that train as one program, or "auto" for what the device holds.
+    """
+
+    device: str
+    workers: int
+    stack: int | str = "auto"
+
+    @property
+    def processes(self) -> int:
+        """Jobs that train at a time; on a GPU one, whose evaluations have the workers."""
+        return self.workers if self.device == "cpu" else 1
+
+
+def pick_machine(device: str, workers: int | None, stack: int | str, precision: str) -> Machine:
+    """Return the machine that these options mean.
+
+    Args:
+        device: auto, cpu, cuda or cuda:N.
+        workers: processes; None is one per core.
+
+    Raises:
+        OffbenchError: a device that this machine lacks, a precision that the device lacks, or a bad value.
+    """
+    if stack != "auto" and not (isinstance(stack, int) and stack >= 1):
+        raise OffbenchError(f"stack must be auto or a whole number from 1, not {stack!r}")
+    device = pick_device(device)
+    check_precision(precision, device)
+    return Machine(device, default_workers(workers), stack)
 
 
 def pick_device(device: str) -> str:
@@ -34,19 +74,17 @@ def pick_device(device: str) -> str:
     if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
         raise OffbenchError(f"device must be auto, cpu, cuda or cuda:N, not {device!r}")
     if kind == "cuda" and (not torch.cuda.is_available() or int(index or 0) >= torch.cuda.device_count()):
-        found = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        raise OffbenchError(
-            f"no device {device}: PyTorch {torch.__version__} sees {found} GPUs here; use --device cpu"
-        )
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        raise OffbenchError(f"no device {device}: PyTorch {torch.__version__} sees {count} GPUs; use --device cpu")
     return device
 
 
 def check_precision(precision: str, device: str) -> None:
-    """Raise OffbenchError if a device (cpu or cuda:N) has no such matrix products."""
+    """Raise OffbenchError if a device (cpu or cuda:N) does not support a precision of matrix products."""
     if precision not in PRECISIONS:
         raise OffbenchError(f"precision must be {', '.join(PRECISIONS[:-1])} or {PRECISIONS[-1]}, not {precision!r}")
     if precision == "tf32" and device == "cpu":
-        raise OffbenchError("precision tf32 is of GPUs; use float32 on a CPU")
+        raise OffbenchError("precision tf32 needs a GPU; use float32 on a CPU")
     native = has_bfloat16() if device == "cpu" else torch.cuda.is_bf16_supported(including_emulation=False)
     if precision == "bfloat16" and not native:
         what = "this processor" if device == "cpu" else f"this GPU ({torch.cuda.get_device_name(device)})"
@@ -55,7 +93,7 @@ def check_precision(precision: str, device: str) -> None:
 
 @contextmanager
 def arithmetic(device: str, precision: str = "float32") -> Iterator[None]:
-    """Set threads and precision of matrix products for a training, and put them back after it.
+    """Set the threads and the precision of matrix products for training, and restore them afterwards.
 
     On the CPU one thread, NumPy's products included: two runs in two processes beat one run on two threads.
 
@@ -63,7 +101,7 @@ def arithmetic(device: str, precision: str = "float32") -> Iterator[None]:
         precision: float32, tf32 (float32 with 10 bits of mantissa in products) or bfloat16 (`perceptrons`).
 
     Raises:
-        OffbenchError: the device has no such products.
+        OffbenchError: the device does not support the precision.
     """
     check_precision(precision, device)
     threads, before = torch.get_num_threads(), torch.get_float32_matmul_precision()
@@ -80,11 +118,11 @@ def arithmetic(device: str, precision: str = "float32") -> Iterator[None]:
         yield
 
 
-def stack_size(kind: type[Algorithm], member: Member, device: str) -> int:
-    """Return how many runs like `member` train best as one stack on this device.
+def stack_size(spec: RunSpec, data: Transitions, device: str) -> int:
+    """Return how many runs like `spec` train best as one stack on this device.
 
-    On a GPU what its free memory holds, measured: the peaks of a stack of one and of three runs over a few updates
-    tell what a run costs beside the dataset.
+    On a GPU it is what the free memory holds, measured: the peak memory of stacks of one and of three runs over a few
+    updates tells what a run takes in addition to the dataset.
     """
     if device == "cpu":
         return CPU_STACK
@@ -92,7 +130,7 @@ def stack_size(kind: type[Algorithm], member: Member, device: str) -> int:
     for runs in (1, 3):
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_reserved(device)
-        stack = Stack(kind, [member] * runs, device)
+        stack = Stack(load_algorithm(spec.algorithm), [spec] * runs, {spec.dataset: data}, device)
         for _ in stack.train(4 * WARM_UP):
             pass
         peaks.append(torch.cuda.max_memory_reserved(device) - before)

@@ -130,7 +130,7 @@ class WandB:
                 project=project,
                 id=known["id"],
                 name="/".join(run.folder.parts[-4:]),
-                config={key: config.get(key) for key in shown},
+                config={key: getattr(config, key) for key in shown},
                 dir=str(run.folder),
                 resume="allow",
                 reinit="create_new",  # a stack's runs are open side by side
@@ -180,5 +180,4 @@ def _news(
 
 def _reference(run: Run) -> tuple[float, float] | None:
     """Return the run's own reference, if its dataset has one."""
-    pair = run.config()["references"]["dataset"]
-    return (float(pair[0]), float(pair[1])) if pair else None
+    return run.config().references.get("dataset")

@@ -1,13 +1,12 @@
-"""Run directories: plain files that a person can read, and that `normalize` and `report` need nothing beside.
+"""Run folders: plain files that a person can read; `normalize` and `report` need nothing else.
 
 runs/<dataset>/<algorithm>/<variant>/seed-<n>/
-    config.json           settings, dataset and its references, seed, versions, hardware, command; `sessions`: what
-                          trained it later, where that was something else
+    config.json           settings, dataset and its references, seed, versions, hardware, command (RunConfig)
     evaluations.csv       step, episode, return, length: every evaluation episode
     losses.csv            step and the mean of each logged quantity since the row before
     policy.safetensors    the policy at the last checkpoint
-    checkpoint-*.safetensors   the newest two; the same command goes on from there
-    diverged.json         only where a run became NaN or infinite: at which step, in which tensor
+    checkpoint-*.safetensors   the newest two; the same command resumes from them
+    diverged.json         only if the run became NaN or infinite: at which step, in which tensor
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import (
@@ -28,25 +27,92 @@ from offbench.common.files import (
     read_json,
     regular,
     remove_leftovers,
-    sha256,
     sole,
     write_bytes,
     write_json,
 )
+from offbench.common.settings import read_back
 from offbench.training.registry import current_settings
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 FORMAT = "offbench-run-1"
-LONGEST = 255  # bytes of a file's name, on the usual file systems
 DIGITS = 8  # of a content hash, where a table must tell two contents of one dataset id apart
-REQUIRED = {  # what a config.json must hold, and of which kind
-    **dict.fromkeys(("algorithm", "variant", "dataset", "dataset_sha256"), str),
-    **dict.fromkeys(("seed", "steps"), int),
-    **dict.fromkeys(("settings", "references"), dict),
-}
 LARGEST = 1e15  # what no step, return or reference reaches: scores and their squares stay finite
 SMALLEST_GAP = 1e-12  # between the references of a score
 MUST_MATCH = ("algorithm", "settings", "dataset", "dataset_sha256", "seed", "eval_every", "eval_episodes")
+
+Evaluations = Mapping[int, list[tuple[float, int]]]  # {step: [(return, length) of each episode]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Session:
+    """What trained a run from `step` on: what its numbers depend on beside settings and seed.
+
+    Attributes:
+        device, precision, versions, hardware: as in offbench.common.provenance.made_with.
+    """
+
+    step: int = 0
+    device: str = ""
+    precision: str = ""
+    versions: dict[str, Any] = field(default_factory=dict)
+    hardware: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """A run's config.json: all that is needed to repeat the run, and to score it without its dataset.
+
+    Attributes:
+        dataset_sha256: the content hash of the dataset.
+        references: (random, expert) returns by name: `dataset`, its own, and `d4rl`, D4RL's constants.
+        env_spec: the environment it is evaluated in, as EnvSpec JSON; None if the dataset names none.
+        device, precision, versions, hardware: of the first session.
+        sessions: the later sessions that were trained with something else.
+    """
+
+    format: str = FORMAT
+    algorithm: str
+    variant: str
+    settings: dict[str, Any]
+    dataset: str
+    dataset_sha256: str
+    seed: int
+    steps: int
+    eval_every: int = 0
+    eval_episodes: int = 0
+    references: dict[str, tuple[float, float] | None]
+    env_id: str = ""
+    env_spec: str | None = None
+    command: str = ""
+    device: str = ""
+    precision: str = ""
+    versions: dict[str, Any] = field(default_factory=dict)
+    hardware: dict[str, Any] = field(default_factory=dict)
+    sessions: tuple[Session, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raise OffbenchError for numbers that no run has."""
+        if self.seed < 0 or not 0 <= self.steps < LARGEST:
+            raise OffbenchError(f"seed {self.seed} or steps {self.steps} is out of range")
+        if self.env_spec is not None:
+            try:
+                is_spec = isinstance(json.loads(self.env_spec), dict)
+            except (ValueError, RecursionError):
+                is_spec = False
+            if not is_spec:
+                raise OffbenchError(f"env_spec is not an EnvSpec but {self.env_spec:.60}")
+        for name, pair in self.references.items():
+            if name not in ("dataset", "d4rl"):
+                raise OffbenchError(f"unknown references {name!r}")
+            if pair and not (max(map(abs, pair)) < LARGEST and pair[1] - pair[0] >= SMALLEST_GAP):
+                raise OffbenchError(f"the references ({name}) are {pair[0]} and {pair[1]}")
+
+    @property
+    def history(self) -> list[Session]:
+        """All sessions, the first one included."""
+        first = Session(device=self.device, precision=self.precision, versions=self.versions, hardware=self.hardware)
+        return [first, *self.sessions]
 
 
 @dataclass(frozen=True)
@@ -82,57 +148,49 @@ class Run:
             remove_leftovers(self.folder)
             yield
 
-    def config(self) -> dict[str, Any]:
+    def config(self) -> RunConfig:
         """Read config.json. Raises OffbenchError if it is missing or damaged."""
         if not self.config_path.exists():
             raise OffbenchError(
                 f"no run in {self.folder} (no config.json); a run is RUNS/DATASET/ALGORITHM/VARIANT/seed-N"
             )
-        config = read_json(self.config_path)
-        for key, kind in REQUIRED.items():
-            if not isinstance(config, dict) or not _is(config.get(key), kind):
-                raise OffbenchError(
-                    f"{self.config_path} is damaged: it lacks {key}, or has an odd one; delete the run to repeat it"
-                )
-        parts = config.get("sessions", [])
-        if not (isinstance(parts, list) and all(isinstance(part, dict) for part in parts)):
-            raise OffbenchError(f"{self.config_path} is damaged: odd sessions; delete the run to repeat it")
-        config["references"] = {name: config["references"].get(name) for name in ("dataset", "d4rl")}
-        for pair in config["references"].values():
-            sound = isinstance(pair, list) and len(pair) == 2 and all(_is(value, float) for value in pair)
-            if pair is not None and not (sound and pair[1] - pair[0] >= SMALLEST_GAP):
-                raise OffbenchError(f"{self.config_path} is damaged: odd references; delete the run to repeat it")
-        return dict(config)
+        values = read_json(self.config_path)
+        if isinstance(values, dict):
+            for session in [values, *values.get("sessions", [])]:
+                if isinstance(session, dict):  # earlier versions wrote tf32, true or false, in place of precision
+                    session.setdefault("precision", "tf32" if session.get("tf32") else "float32")
+        return read_back(RunConfig, values, self.config_path, "delete the run to repeat it")
 
-    def claim(self, config: Mapping[str, Any]) -> None:
-        """Write config.json, or check that the run in this directory is the same one.
+    def claim(self, config: RunConfig) -> None:
+        """Write config.json, or check that the run in this folder is the same one.
 
         Raises:
-            OffbenchError: another run lives here, or one whose config.json is gone.
+            OffbenchError: the folder holds another run, or one whose config.json is gone.
         """
         if self.config_path.exists():
-            known = self.config()
+            existing = self.config()
             for key in MUST_MATCH:
-                before = known.get(key)
+                old, new = getattr(existing, key), getattr(config, key)
                 if key == "settings":
-                    before = current_settings(known["algorithm"], known["settings"], str(self.folder))
-                if before == config[key]:
+                    old = current_settings(existing.algorithm, old, str(self.folder))
+                if old == new:
                     continue
                 if key == "dataset_sha256":
                     raise OffbenchError(
-                        f"{self.folder} was trained on another content of {config['dataset']}, which has been "
-                        "recorded again since; delete that run or give another --runs"
+                        f"{self.folder} was trained on another content of {config.dataset}, which has been recorded "
+                        "again since; delete that run or give another --runs"
                     )
+                flag = f"--{key.replace('_', '-')}" if key.startswith("eval") else key
                 raise OffbenchError(
-                    f"{self.folder} holds a run with {key} {before!r}, not {config[key]!r}; "
-                    "delete it or give another --runs"
+                    f"{self.folder} was started with {flag} {old}, not {new}; delete it or give another --runs"
                 )
         elif any(self.folder.glob("checkpoint-*.safetensors")):
             raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
         else:
             with self.locked():
                 if not self.config_path.exists():
-                    write_json(self.config_path, config)
+                    values = dataclasses.asdict(config)
+                    write_json(self.config_path, {k: v for k, v in values.items() if k != "sessions" or v})
                     return
             self.claim(config)  # another process was faster
 
@@ -142,34 +200,46 @@ class Run:
         Args:
             made: device, versions and so on (offbench.common.provenance.made_with).
         """
-        config = self.config()
-        changed = dict(config, steps=max(steps, config["steps"]))
-        if {key: sessions(config)[-1].get(key) for key in made} != made:
-            changed["sessions"] = [*config.get("sessions", []), {"step": step, **made}]
-        if changed != config:
+        config, written = self.config(), read_json(self.config_path)
+        changed = dict(written, steps=max(steps, config.steps))
+        if dataclasses.replace(config.history[-1], step=step) != (session := Session(step=step, **made)):
+            changed["sessions"] = [*written.get("sessions", []), dataclasses.asdict(session)]
+        if changed != written:
             write_json(self.config_path, changed)
 
     def mark_diverged(self, step: int, tensor: str) -> None:
-        """Note that the run cannot go on: `tensor` held NaN or infinity at `step`."""
+        """Note that the run cannot continue: `tensor` held NaN or infinity at `step`."""
         write_json(self.folder / "diverged.json", {"step": step, "tensor": tensor})
 
     @property
     def diverged(self) -> bool:
-        """Whether the run is marked so; it is not trained on until that file is deleted."""
+        """Whether the run is marked as diverged; it is not trained any further until diverged.json is deleted."""
         return (self.folder / "diverged.json").exists()
+
+    def finished(self, steps: int) -> bool:
+        """Return whether the run is done: checkpoint and evaluation of step `steps`, and a policy."""
+        from offbench.common import checkpoints  # imports PyTorch, which `normalize` does without
+
+        if (
+            steps not in checkpoints.steps(self.folder)
+            or not self.config_path.exists()
+            or not self.policy_path.exists()
+        ):
+            return False
+        return not self.config().env_spec or steps in self.evaluations()
 
     def evaluations(self) -> dict[int, list[tuple[float, int]]]:
         """Return {step: [(return, length) of each episode]} in order of steps; {} if there are none yet.
 
         Raises:
-            OffbenchError: the file is damaged: a row is odd, an episode is missing or there twice, or the steps are
-                not those of config.json.
+            OffbenchError: the file is damaged: a row is malformed, an episode is missing or there twice, or the steps
+                are not those of config.json.
         """
         if not self.evaluations_path.exists():
             return {}
-        config = self.config() if self.config_path.exists() else {}
-        last, episodes = config.get("steps", LARGEST), config.get("eval_episodes")
-        found: dict[int, list[tuple[float, int]]] = {}
+        config = self.config() if self.config_path.exists() else None
+        last, count = (config.steps, config.eval_episodes) if config else (LARGEST, 0)
+        evaluations: dict[int, list[tuple[float, int]]] = {}
         with damage(f"{self.evaluations_path} is damaged", "delete the run to repeat it"):
             with open(self.evaluations_path, newline="", encoding="utf-8", opener=regular) as file:
                 reader = csv.DictReader(file, strict=True)
@@ -177,22 +247,22 @@ class Run:
                     raise ValueError(f"its columns are {reader.fieldnames}")
                 for row in reader:
                     if None in row or None in row.values():
-                        raise ValueError(f"line {reader.line_num} has not {len(EVALUATION_COLUMNS)} cells")
+                        raise ValueError(f"line {reader.line_num} does not have {len(EVALUATION_COLUMNS)} cells")
                     value, step = float(row["return"]), _count(row["step"])
                     if not abs(value) < LARGEST:
                         raise ValueError(f"a return is {value}")
                     if step > last:
                         raise ValueError(f"step {step} of a run of {last} steps")
-                    rows = found.setdefault(step, [])
-                    if _count(row["episode"]) != len(rows):
-                        raise ValueError(f"episode {len(rows)} of step {step} is missing, or one is there twice")
-                    rows.append((value, _count(row["length"])))
-            for step, rows in found.items():
-                if len(rows) != (episodes or len(rows)):
-                    raise ValueError(f"step {step} has {len(rows)} episodes, not {episodes}")
-        return dict(sorted(found.items()))
+                    episodes = evaluations.setdefault(step, [])
+                    if _count(row["episode"]) != len(episodes):
+                        raise ValueError(f"episode {len(episodes)} of step {step} is missing, or one is there twice")
+                    episodes.append((value, _count(row["length"])))
+            for step, episodes in evaluations.items():
+                if len(episodes) != (count or len(episodes)):
+                    raise ValueError(f"step {step} has {len(episodes)} episodes, not {count}")
+        return dict(sorted(evaluations.items()))
 
-    def write_evaluations(self, evaluations: Mapping[int, list[tuple[float, int]]]) -> None:
+    def write_evaluations(self, evaluations: Evaluations) -> None:
         """Replace evaluations.csv."""
         rows = (
             (step, i, repr(value), length)
@@ -222,31 +292,18 @@ class Run:
 def _count(text: str) -> int:
     """Return a whole number from 0 as offbench writes it."""
     if not (text.isascii() and text.isdigit() and len(text) < 16):
-        raise ValueError(f"{text[:40]!r} is no step, episode or length")
+        raise ValueError(f"{text[:40]!r} is not a step, episode or length")
     return int(text)
-
-
-def _is(value: Any, kind: type) -> bool:
-    """Return whether a JSON value is of a kind; numbers must be finite, and true is no number."""
-    if kind in (int, float):
-        kinds = int if kind is int else int | float
-        return isinstance(value, kinds) and not isinstance(value, bool) and abs(value) < LARGEST
-    return isinstance(value, kind)
 
 
 def _short(value: Any) -> Any:
     return f"{value:.6g}" if isinstance(value, float) else value
 
 
-def sessions(config: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return what has trained a run, one after the other: each has device, versions, hardware and so on."""
-    return [config, *config.get("sessions", [])]
-
-
 def find_runs(root: Path) -> list[Run]:
-    """Return all runs below a folder, in order of their paths; other programs' config.json are passed over.
+    """Return all runs below a folder in the order of their paths, those with an unreadable config.json included.
 
-    A run whose config.json cannot be read is among them.
+    The config.json files of other programs are ignored.
     """
     return [Run(path.parent) for path in sorted(root.rglob("config.json")) if _is_run(path)]
 
@@ -257,45 +314,3 @@ def _is_run(path: Path) -> bool:
     except OffbenchError:
         return path.parent.name.startswith("seed-")
     return isinstance(config, dict) and config.get("format") == FORMAT
-
-
-def run_folder(root: Path, dataset_id: str, algorithm: str, variant: str, seed: int) -> Path:
-    """Return runs/<dataset>/<algorithm>/<variant>/seed-<n>; a long variant is cut short and ends in its hash."""
-    return root / dataset_id / algorithm / folder_name(variant) / f"seed-{seed}"
-
-
-def folder_name(variant: str) -> str:
-    """Return the name of a variant's folder: the variant itself, if a file system takes a name that long."""
-    if len(variant.encode()) <= LONGEST:
-        return variant
-    ending = f"...{sha256(variant.encode())[:16]}"
-    return variant.encode()[: LONGEST - len(ending)].decode(errors="ignore") + ending
-
-
-def variant(config: Any, precision: str = "float32") -> str:
-    """Name a config by the settings that differ from their defaults: `default` or `alpha=1,beta=0.5`.
-
-    A precision other than float32 is the last of them: `beta=0.5,precision=bfloat16`.
-    """
-    parts = []
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if value != field.default:
-            parts.append(f"{field.name}={_word(value)}")
-    if precision != "float32":
-        parts.append(f"precision={precision}")
-    return ",".join(parts) or "default"
-
-
-def _word(value: Any) -> str:
-    if isinstance(value, tuple):
-        return "x".join(str(item) for item in value)
-    if isinstance(value, float):
-        return short if float(short := f"{value:g}") == value else repr(value)
-    return quote(value, safe="") if isinstance(value, str) else str(value).lower()
-
-
-def settings_dict(config: Any) -> dict[str, Any]:
-    """Return a config as JSON has it (tuples become lists)."""
-    values: Iterable[tuple[str, Any]] = dataclasses.asdict(config).items()
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in values}

@@ -17,8 +17,10 @@ from torch import Tensor
 from offbench.algorithm.capture import NotCapturableError, Recording, attributes, changed_attribute, record
 from offbench.algorithm.interface import Algorithm, PolicyParts, check_logs, stack_configs
 from offbench.common.errors import OffbenchError
+from offbench.data.transitions import Transitions
 from offbench.rollouts.policy import Policy, check_networks
-from offbench.training.batches import CHUNK, Member, Store, draw_chunk
+from offbench.training.batches import CHUNK, Store, draw_chunk
+from offbench.training.spec import RunSpec
 
 Sums = list[tuple[str, float, int]]  # of each logged quantity: its name, its sum, and over how many updates
 RECORDED = 6  # updates of a phase before a replay is trusted on a CPU: all but the first are recorded and compared
@@ -164,11 +166,14 @@ class Program:
 class Stack:
     """The learning state of a stack of runs: everything but files and evaluations."""
 
-    def __init__(self, kind: type[Algorithm], members: Sequence[Member], device: str) -> None:
-        self.members, self.device = list(members), torch.device(device)
-        self.seeds = [member.seed for member in members]
-        config = stack_configs([member.config for member in members], self.device)
-        dims = {(m.data.observations.shape[1], m.data.actions.shape[1]) for m in members}
+    def __init__(
+        self, kind: type[Algorithm], specs: Sequence[RunSpec], datasets: Mapping[str, Transitions], device: str
+    ) -> None:
+        self.specs, self.device = list(specs), torch.device(device)
+        self.data = [datasets[spec.dataset] for spec in specs]
+        self.seeds = [spec.seed for spec in specs]
+        config = stack_configs([spec.config for spec in specs], self.device)
+        dims = {(data.observations.shape[1], data.actions.shape[1]) for data in self.data}
         if len(dims) != 1:
             raise OffbenchError(f"datasets of one stack must have the same shapes, not {sorted(dims)}")
         observation_dim, action_dim = dims.pop()
@@ -177,7 +182,7 @@ class Stack:
         if not self.algorithm.learned:
             raise OffbenchError(f"{kind.__name__} has no networks among its attributes: a checkpoint would be empty")
         self.batch_size: int = config.batch_size
-        self.store = Store(members, config.normalize, self.device, self.algorithm.uses_next_actions)
+        self.store = Store(specs, datasets, config.normalize, self.device, self.algorithm.uses_next_actions)
         self.noise_spec = self.algorithm.noise_spec(self.algorithm.config)
         self.program = Program(self.algorithm, self.store)
         self.step = 0
@@ -196,18 +201,18 @@ class Stack:
     def logged(self) -> list[dict[str, float]]:
         """Return each run's mean of everything logged since the last call."""
         columns = self.program.logged()
-        return [{name: values[run] for name, values in columns.items()} for run in range(len(self.members))]
+        return [{name: values[run] for name, values in columns.items()} for run in range(len(self.specs))]
 
     def policy(self, run: int) -> Policy:
         """Return one run's policy as it is now, for the NumPy rollouts and the policy file."""
-        member, data = self.members[run], self.members[run].data
+        spec, data = self.specs[run], self.data[run]
         parts = self.algorithm.policy(run)
         mean, std = self.store.normalizers[run]
         actor, critic = (tuple((w.numpy(), b.numpy()) for w, b in p) for p in (parts.layers, parts.critic))
         origin = {
-            "algorithm": member.algorithm,
+            "algorithm": spec.algorithm,
             "step": self.step,
-            "seed": member.seed,
+            "seed": spec.seed,
             "dataset": data.dataset_id,
             "dataset_sha256": data.content,
         }
@@ -242,7 +247,7 @@ class Stack:
         for name, place in self.run_tensors(run).items():
             found = tensors.get(name)
             if found is None or found.shape != place.shape:
-                raise OffbenchError(f"the checkpoint in {self.members[run].run.folder} does not fit; delete the run")
+                raise OffbenchError(f"the checkpoint in {self.specs[run].folder} does not fit; delete the run")
             with torch.no_grad():
                 place.copy_(found)
 

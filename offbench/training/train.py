@@ -1,29 +1,29 @@
-"""`train`: from an algorithm's name, datasets, settings and seeds to stacks of runs, and their jobs."""
+"""`train`: one algorithm on datasets; and how any runs are trained, those of a grid too.
+
+specs -> group -> jobs -> what is left of them (pending) -> run_jobs, or a cluster
+"""
 
 from __future__ import annotations
 
-import itertools
 import operator
-import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from offbench.common import checkpoints
-from offbench.common.errors import OffbenchError, unknown
-from offbench.common.processes import cores, default_workers
-from offbench.common.settings import build, check, fields
+from offbench.common.errors import OffbenchError
+from offbench.common.settings import build
 from offbench.data import transitions
-from offbench.training.batches import Member
-from offbench.training.devices import check_precision, pick_device
-from offbench.training.grouping import Part, cut, diverged, pending, with_evaluators
-from offbench.training.jobs import Job, Order, complain, run_jobs
-from offbench.training.loggers import Destinations
+from offbench.training.devices import Machine, pick_machine
+from offbench.training.grouping import check_datasets, group, load_datasets, pending
+from offbench.training.jobs import raise_first, run_jobs
+from offbench.training.loggers import NOWHERE, Destinations
 from offbench.training.registry import current_settings, load_algorithm
-from offbench.training.run import Run, run_folder, settings_dict, variant
+from offbench.training.run import Run
+from offbench.training.spec import Job, RunSpec, Times, specs_of
 from offbench.training.stack import Stack
-from offbench.training.trainer import Schedule
 
 
 def train(
@@ -44,21 +44,20 @@ def train(
     command: str = "",
     **settings: Any,
 ) -> list[Path]:
-    """Train runs of one algorithm in stacks, going on from their newest checkpoints.
+    """Train one algorithm on one or more datasets, or resume the runs from their newest checkpoints.
 
     Args:
         algorithm: a registered name: td3_bc, bdb, cql, or a third party's.
         dataset: one id of a local Minari dataset, or several.
-        seeds: one seed or several; each run's randomness depends on its own seed alone.
+        seeds: one seed or several; a run's random numbers depend on its own seed alone.
         steps: updates of each run.
-        eval_every, eval_episodes: every so many updates, so many episodes of the deterministic policy.
+        eval_every, eval_episodes: updates between evaluations, and episodes of the deterministic policy in each.
         device: auto, cpu, cuda or cuda:N.
-        workers: processes (default: one a core). Several runs on a CPU train in as many processes; one run, or a
-            GPU, has them for its evaluations.
-        stack: most runs that train as one program; "auto" follows the device's memory.
+        workers: processes for training and evaluation (default: one per core).
+        stack: the most runs that train as one program; "auto" follows the device's memory.
         precision: of matrix products: float32, tf32 (GPUs) or bfloat16 (GPUs, and processors that multiply it
             natively). Weights, Adam, targets, losses and normalization are float32 in each.
-        runs: the folder of all run directories.
+        runs: the folder of all run folders.
         tensorboard: write TensorBoard event files into each run's folder `tensorboard`.
         wandb: a Weights & Biases project to show the runs in.
         command: what the user typed, for the run's config.json.
@@ -66,95 +65,101 @@ def train(
             `beta=[0.25, 0.5, "adaptive"]`, or `hidden=[(64, 64), (256, 256)]`.
 
     Returns:
-        The runs' directories: datasets x settings x seeds.
+        The runs' folders: datasets x settings x seeds.
 
     Raises:
-        OffbenchError: anything that the user can mend, said in one line.
+        OffbenchError: anything that the user can fix, in one line.
     """
-    kind = load_algorithm(algorithm)
-    configs = configurations(kind.Config, settings, algorithm)
-    seed_list = _seed_list(seeds)
-    _check_numbers(seed_list, steps, eval_every, eval_episodes)
+    times = Times(_seed_list(seeds), steps, eval_every, eval_episodes)
     names = [dataset] if isinstance(dataset, str) else list(dict.fromkeys(dataset))
+    variants = specs_of(algorithm, settings, names, times, Path(runs), precision)
+    _check_times(times)
     if not names:
         raise OffbenchError("give at least one dataset")
-    place = pick_device(device)
-    check_precision(precision, place)
-    orders = [
-        Order(
-            algorithm,
-            name,
-            settings_dict(config),
-            seed,
-            str(run_folder(Path(runs), name, algorithm, variant(config, precision), seed)),
-        )
-        for name, config, seed in itertools.product(names, configs, seed_list)
-    ]
+    specs = [spec for name in names for variant in variants for spec in variant if spec.dataset == name]
+    machine = pick_machine(device, workers, stack, precision)
     show = Destinations(tensorboard, wandb)
     show.check()
-    processes = default_workers(workers) if place == "cpu" else 1
-    schedule = Schedule(steps, eval_every, eval_episodes, place, workers=0, show=show, precision=precision)
-    parts = cut(orders, place, processes, stack)
-    jobs = [job for part in parts for job in pending(part, schedule, command=command)]
-    _say_finished(parts, jobs)
-    if place != "cpu":
-        jobs = with_evaluators(jobs, default_workers(workers))
-    elif len(jobs) == 1:
-        jobs = with_evaluators(jobs, max(1, cores() - 1) if workers is None else workers)
-    complain(diverged(parts) + (run_jobs(jobs, processes) if jobs else []))
-    return [Path(order.folder) for order in orders]
+    training = Training(specs, machine, command=command, show=show)
+    if training.finished:
+        total = f"{len(specs)} run{'s' if len(specs) > 1 else ''}"
+        print(f"already finished: {training.finished} of {total}", file=sys.stderr)
+    raise_first(training.diverged + training.run())
+    return [spec.folder for spec in specs]
 
 
-def _say_finished(parts: Sequence[Part], jobs: Sequence[Job]) -> None:
-    """Print how many runs need nothing more: without it, a command that does nothing says nothing."""
-    runs = [member.run for part in parts for member in part.members]
-    finished = len(runs) - sum(run.diverged for run in runs) - sum(len(job.orders) for job in jobs)
-    if finished:
-        print(f"already finished: {finished} of {len(runs)} run{'s' if len(runs) > 1 else ''}", file=sys.stderr)
+class Training:
+    """Runs that are to be trained on a machine, as jobs.
+
+    Attributes:
+        jobs: what was left to train at first.
+        diverged: a line for each run that diverged in an earlier session; they are left as they are.
+        finished: how many runs are done already.
+
+    Args:
+        command: what the user typed, for config.json.
+        show: live views of the training.
+
+    Raises:
+        OffbenchError: a dataset is missing or damaged, or a run's folder holds another run.
+    """
+
+    def __init__(
+        self, specs: Sequence[RunSpec], machine: Machine, *, command: str = "", show: Destinations = NOWHERE
+    ) -> None:
+        self.machine, self._command = machine, command
+        self._datasets = load_datasets(specs)
+        check_datasets(self._datasets)
+        self._groups = [replace(job, show=show) for job in group(specs, self._datasets, machine)]
+        self.jobs = self.pending()
+        self.diverged = [
+            f"{spec.folder} has diverged before and is left as it is; delete it to try again"
+            for job in self._groups
+            for spec in job.specs
+            if spec.run.diverged
+        ]
+        self.finished = len(specs) - len(self.diverged) - sum(len(job.specs) for job in self.jobs)
+
+    def pending(self) -> list[Job]:
+        """Return what is left to train as the runs' folders are now."""
+        return [left for job in self._groups for left in pending(job, self._datasets, command=self._command)]
+
+    def run(
+        self,
+        execute: Callable[[Sequence[Job], int], list[str]] = run_jobs,
+        *,
+        deadline: float | None = None,
+        cost: Mapping[str, float] | None = None,
+    ) -> list[str]:
+        """Train what is left.
+
+        Args:
+            execute: trains jobs, so many at a time, and returns what went wrong, a line each.
+            deadline: `time.time()` to stop at, with checkpoints.
+            cost: seconds per update of each algorithm, for the time left.
+
+        Returns:
+            What went wrong, a line each.
+        """
+        jobs = [replace(job, deadline=deadline, cost=(cost or {}).get(job.first.algorithm, 1.0)) for job in self.jobs]
+        jobs.sort(
+            key=lambda job: job.work, reverse=True
+        )  # a long one that starts last would run beside idle processes
+        return execute(jobs, self.machine.processes) if jobs else []
 
 
-def _seed_list(seeds: int | Sequence[int]) -> list[int]:
+def _seed_list(seeds: int | Sequence[int]) -> tuple[int, ...]:
     try:
-        return [operator.index(seed) for seed in ([seeds] if isinstance(seeds, int) else seeds)]
+        return tuple(operator.index(seed) for seed in ([seeds] if isinstance(seeds, int) else seeds))
     except TypeError:
         raise OffbenchError(f"seeds must be whole numbers, not {seeds!r}") from None
 
 
-def configurations(cls: type, settings: Mapping[str, Any], algorithm: str) -> list[Any]:
-    """Return the different configs of the product of all lists given. Raises OffbenchError for a bad setting."""
-    known, columns = fields(cls), []
-    for name, value in settings.items():
-        if name not in known:
-            raise unknown(f"setting of {algorithm}", name, known)
-        values = list(value) if _several(value, known[name].default) else [value]
-        if not values:
-            raise OffbenchError(f"{algorithm}: {name} got an empty list")
-        if len(values) > 1 and isinstance(known[name].default, tuple):
-            _check_lists(values, f"{algorithm}: {name}")
-        columns.append([(name, check(cls, name, item, algorithm)) for item in values])
-    return list(dict.fromkeys(cls(**dict(row)) for row in itertools.product(*columns)))
-
-
-def _several(value: Any, default: Any) -> bool:
-    """Return whether a list holds values of a setting, rather than being one, as (64, 64) is of `hidden`."""
-    if not isinstance(value, list | tuple):
-        return False
-    return not isinstance(default, tuple) or any(isinstance(item, list | tuple | str) for item in value)
-
-
-def _check_lists(values: Sequence[Any], what: str) -> None:
-    """Refuse `64 64`, which may mean one network of two layers or two of one."""
-    if any(isinstance(item, str) and not re.search("[,x]", item) for item in values):
-        typed = [str(item) for item in values]
-        raise OffbenchError(
-            f"{what} takes lists such as 32,32 64,64, not {' '.join(typed)}; one list is {','.join(typed)}"
-        )
-
-
-def _check_numbers(seeds: Sequence[int], steps: int, eval_every: int, eval_episodes: int) -> None:
-    if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
-        raise OffbenchError(f"seeds must be different whole numbers from 0, not {list(seeds)}")
-    for name, value in {"steps": steps, "eval_every": eval_every, "eval_episodes": eval_episodes}.items():
+def _check_times(times: Times) -> None:
+    if not times.seeds or min(times.seeds) < 0 or len(set(times.seeds)) < len(times.seeds):
+        raise OffbenchError(f"seeds must be different whole numbers from 0, not {list(times.seeds)}")
+    for name in ("steps", "eval_every", "eval_episodes"):
+        value = getattr(times, name)
         if not isinstance(value, int) or value < 1:
             raise OffbenchError(f"{name} must be a whole number from 1, not {value}")
 
@@ -166,17 +171,19 @@ def restore(run: Run) -> Stack:
         OffbenchError: no run, no checkpoint, or its dataset is gone or changed.
     """
     config = run.config()
-    kind = load_algorithm(config["algorithm"])
-    recorded = current_settings(config["algorithm"], config["settings"], str(run.folder))
+    kind = load_algorithm(config.algorithm)
+    recorded = current_settings(config.algorithm, config.settings, str(run.folder))
     settings: Any = build(kind.Config, recorded, f"{run.config_path}: settings")
-    data = transitions.load(config["dataset"])
-    if data.content != config["dataset_sha256"]:
+    data = transitions.load(config.dataset)
+    if data.content != config.dataset_sha256:
         raise OffbenchError(f"{data.dataset_id} is no longer the dataset that {run.folder} was trained on")
-    found = checkpoints.load_newest(run.folder)
-    if found is None:
+    newest = checkpoints.load_newest(run.folder)
+    if newest is None:
         raise OffbenchError(f"{run.folder} has no checkpoint yet; train it to its first one")
-    tensors, state = found
-    stack = Stack(kind, [Member(run, config["seed"], settings, data, config["algorithm"])], "cpu")
+    tensors, state = newest
+    times = config.steps, config.eval_every, config.eval_episodes
+    spec = RunSpec(config.algorithm, settings, config.dataset, config.seed, *times, run.folder)
+    stack = Stack(kind, [spec], {config.dataset: data}, "cpu")
     stack.load(0, tensors)
     stack.step = int(state["step"])
     return stack

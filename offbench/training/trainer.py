@@ -1,8 +1,8 @@
-"""The training loop: a stack of runs, from its members to their checkpoints and evaluations.
+"""The training loop of a job: from the newest common checkpoint to its runs' last step.
 
-every eval_every steps:  checkpoint, then evaluate a snapshot on worker processes while training goes on
-a deadline, or Ctrl-C:   stops at the next chunk with a checkpoint; the same command goes on from there
-a run that diverges:     is left out from there on and marked; the others go on, they share nothing with it
+every eval_every steps:  checkpoint, then evaluate a snapshot on worker processes while training continues
+a deadline or Ctrl-C:    stops at the next chunk with a checkpoint; the same command resumes from it
+a run that diverges:     is marked and left out from there on; the other runs continue, as they share nothing with it
 """
 
 from __future__ import annotations
@@ -11,27 +11,28 @@ import contextlib
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from offbench.algorithm.interface import Algorithm
 from offbench.common import checkpoints
 from offbench.common.files import disk_errors
 from offbench.common.processes import stops_noted
 from offbench.common.provenance import made_with
 from offbench.common.scores import normalize
 from offbench.common.seeds import Purpose
+from offbench.data.transitions import Transitions
 from offbench.rollouts.rollouts import Outcome, Rollouts, result
-from offbench.training.batches import Member
-from offbench.training.loggers import NOWHERE, Destinations, Loggers
+from offbench.training.loggers import Loggers
+from offbench.training.registry import load_algorithm
+from offbench.training.run import Run
+from offbench.training.spec import Job
 from offbench.training.stack import Stack, slice_of
 
-LOG_EVERY = 1000  # updates behind a row of losses.csv
-QUICK = 1.0  # seconds; checkpoints that take longer are not written at every evaluation
+LOG_EVERY = 1000  # updates per row of losses.csv
+QUICK = 1.0  # seconds; a checkpoint that takes longer is not written at every evaluation
 SHARE = 0.05  # of the time that slow checkpoints may take
 
 STOPPED = "stopped with a checkpoint"  # the last note of a training that was interrupted
@@ -39,74 +40,60 @@ STOPPED = "stopped with a checkpoint"  # the last note of a training that was in
 Report = Callable[[int, str], None]  # takes the step and a note such as the last score
 
 
-@dataclass(frozen=True)
-class Schedule:
-    """How long a stack trains, and when it is evaluated.
+class Trainer:
+    """The state of a job while it trains: the stack, its evaluations and losses, and the runs' files.
 
-    Attributes:
-        steps: updates of each run.
-        eval_every, eval_episodes: every so many updates, so many episodes.
-        device: PyTorch's name of it.
-        workers: evaluation processes; 0 evaluates in this process.
-        deadline: time.time() after which the stack stops at its next chunk, None for never.
-        show: live views of the training, none by default.
+    Args:
+        datasets: by the names that the job's specs give them.
     """
 
-    steps: int
-    eval_every: int
-    eval_episodes: int
-    device: str
-    workers: int
-    deadline: float | None = None
-    show: Destinations = NOWHERE
-    precision: str = "float32"
-
-
-class Trainer:
-    """A stack with its files: checkpoints, losses, evaluations beside the training."""
-
-    def __init__(self, kind: type[Algorithm], members: Sequence[Member], schedule: Schedule) -> None:
-        self.members, self.schedule = list(members), schedule
-        self.made = made_with(schedule.device, schedule.precision)
-        self.stack = Stack(kind, members, schedule.device)
-        self.loggers = Loggers([member.run for member in members], schedule.show)
-        self.evaluations: list[dict[int, list[tuple[float, int]]]] = [{} for _ in members]
-        self.losses: list[list[dict[str, float]]] = [[] for _ in members]
-        self.pending: list[tuple[int, int, Future[list[Outcome]]]] = []  # (run, step, outcomes)
+    def __init__(self, job: Job, datasets: Mapping[str, Transitions]) -> None:
+        self.job = job
+        self.runs: list[Run] = [spec.run for spec in job.specs]
+        self.made = made_with(job.device, job.first.precision)
+        self.stack = Stack(load_algorithm(job.first.algorithm), job.specs, datasets, job.device)
+        self.loggers = Loggers(self.runs, job.show)
+        self.evaluations: list[dict[int, list[tuple[float, int]]]] = [{} for _ in self.runs]
+        self.losses: list[list[dict[str, float]]] = [[] for _ in self.runs]
+        self.pending: list[tuple[int, int, Future[list[Outcome]]]] = []  # (run, step, episodes) under way
         self.rollouts: Rollouts | None = None
         self.note = ""
-        self.lost: dict[int, str] = {}  # runs that have diverged, and how
+        self.diverged: dict[int, str] = {}  # runs that have diverged, and what to tell the user
         self.stops: list[int] = []  # Ctrl-C and SIGTERM, as they came
-        self._saved, self._took = time.monotonic(), 0.0  # when the last checkpoint was written, and how long it took
+        self._saved, self._save_seconds = (
+            time.monotonic(),
+            0.0,
+        )  # when the last checkpoint was written, how long it took
 
     def train(self, report: Report) -> list[str]:
-        """Go on from the newest step that all runs have, to the schedule's end or its deadline.
+        """Train from the newest step that all runs have a checkpoint of, to the last one or the deadline.
 
         Returns:
             A line for each run that has diverged.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C came, or whatever SIGTERM does, once a checkpoint is written.
+            KeyboardInterrupt: Ctrl-C, or whatever SIGTERM does, once a checkpoint is written.
         """
+        steps = self.job.first.steps
         with contextlib.ExitStack() as resources:
             self.stops = resources.enter_context(stops_noted(second_at_once=True))
-            for member in self.members:
-                resources.enter_context(member.run.locked())
+            for run in self.runs:
+                resources.enter_context(run.locked())
             self._resume()
-            for member in self.members:
-                member.run.begin(self.stack.step, self.schedule.steps, self.made)
+            for run in self.runs:
+                run.begin(self.stack.step, steps, self.made)
             resources.enter_context(self.loggers)
-            spec = self.members[0].data.env_spec  # datasets of one stack are of one environment
+            spec = self.stack.data[0].env_spec  # datasets of one stack are of one environment
             if spec:
-                self.rollouts = resources.enter_context(Rollouts(spec, self.schedule.workers))
+                self.rollouts = resources.enter_context(Rollouts(spec, self.job.workers))
             report(self.stack.step, "")
             if self._evaluates_at(self.stack.step) and self.stack.step:
                 self._evaluate()
-            while self.stack.step < self.schedule.steps and len(self.lost) < len(self.members):
+            while self.stack.step < steps and len(self.diverged) < len(self.runs):
                 in_time = self._train_to(self._next_stop(), report)
                 self._mark_diverged()
-                self._collect()  # evaluations of earlier steps land first, so a resume misses none
-                if self.stack.step and (not in_time or self.stack.step == self.schedule.steps or self._has_time()):
+                self._collect()  # evaluations of earlier steps are written first, so a resume misses none
+                if self.stack.step and (not in_time or self.stack.step == steps or self._checkpoint_is_due()):
                     self._checkpoint()
                 if not in_time:
                     break
@@ -114,133 +101,132 @@ class Trainer:
                     self._evaluate()
             self._collect()
             self._show()
-            saved = self.stops and self.stack.step and any(self._going())
+            saved = self.stops and self.stack.step and any(self._active())
             report(self.stack.step, STOPPED if saved else self.note)
-        return list(self.lost.values())
+        return list(self.diverged.values())
 
     def _train_to(self, stop: int, report: Report) -> bool:
         """Train up to `stop`; return False if the deadline, Ctrl-C or SIGTERM came first."""
         if self.stops:
             return False
         for step in self.stack.train(stop):
-            late = self.schedule.deadline is not None and time.time() > self.schedule.deadline and step < stop
+            late = self.job.deadline is not None and time.time() > self.job.deadline and step < stop
             if step % LOG_EVERY == 0 or step == stop:
                 for rows, row in zip(self.losses, self.stack.logged(), strict=True):
                     rows.append({"step": step, **row})
-            self._arrived()
+            if self.pending and all(future.done() for _, _, future in self.pending):
+                self._collect()
             report(step, self.note)
             if late or self.stops:
                 return False
         return True
 
-    def _has_time(self) -> bool:
-        """Whether a checkpoint is due: always if they are quick, else when they take a small share of the time."""
-        return self._took < QUICK or time.monotonic() - self._saved > self._took / SHARE
+    def _checkpoint_is_due(self) -> bool:
+        """Return whether to write a checkpoint: always if that is quick, else for a small share of the time."""
+        return self._save_seconds < QUICK or time.monotonic() - self._saved > self._save_seconds / SHARE
 
     def _mark_diverged(self) -> None:
         """Leave out the runs that hold NaN or infinity: their files stay as their last checkpoint left them."""
-        for run, tensor in self.stack.diverged().items():
-            if run not in self.lost:
-                folder = self.members[run].run.folder
-                self.lost[run] = (
-                    f"{folder}: {tensor} became NaN or infinite by step {self.stack.step}; its last checkpoint is kept"
+        for i, tensor in self.stack.diverged().items():
+            if i not in self.diverged:
+                run, step = self.runs[i], self.stack.step
+                self.diverged[i] = (
+                    f"{run.folder}: {tensor} became NaN or infinite by step {step}; its last checkpoint is kept"
                 )
-                self.members[run].run.mark_diverged(self.stack.step, tensor)
+                run.mark_diverged(step, tensor)
 
-    def _going(self) -> Iterator[tuple[int, Member]]:
-        return ((run, member) for run, member in enumerate(self.members) if run not in self.lost)
+    def _active(self) -> Iterator[tuple[int, Run]]:
+        """Yield the runs that have not diverged, with their index."""
+        return ((i, run) for i, run in enumerate(self.runs) if i not in self.diverged)
 
     def _next_stop(self) -> int:
         """Return the next step with a checkpoint: every evaluation, and the end."""
-        every = self.schedule.eval_every
-        return min(self.schedule.steps, (self.stack.step // every + 1) * every)
+        every = self.job.first.eval_every
+        return min(self.job.first.steps, (self.stack.step // every + 1) * every)
 
     def _evaluates_at(self, step: int) -> bool:
-        return step % self.schedule.eval_every == 0 or step == self.schedule.steps
+        return step % self.job.first.eval_every == 0 or step == self.job.first.steps
 
     def _resume(self) -> None:
-        """Load the newest step that all runs have a whole checkpoint of; forget what came after it."""
-        common = set.intersection(*(set(checkpoints.steps(m.run.folder)) for m in self.members))
-        for step in sorted((s for s in common if s <= self.schedule.steps), reverse=True):
-            found = [checkpoints.load_checkpoint(m.run.folder, step) for m in self.members]
-            if all(found):
-                for run, (tensors, state) in enumerate(f for f in found if f):
-                    self.stack.load(run, tensors)
-                    self.stack.program.go_on_logging(run, state.get("unlogged", []))
+        """Load the newest step that all runs have an intact checkpoint of, and drop what came after it."""
+        common = set.intersection(*(set(checkpoints.steps(run.folder)) for run in self.runs))
+        for step in sorted((s for s in common if s <= self.job.first.steps), reverse=True):
+            loaded = [checkpoints.load_checkpoint(run.folder, step) for run in self.runs]
+            if all(loaded):
+                for i, (tensors, state) in enumerate(checkpoint for checkpoint in loaded if checkpoint):
+                    self.stack.load(i, tensors)
+                    self.stack.program.go_on_logging(i, state.get("unlogged", []))
                 self.stack.step = step
                 break
-        for run, member in enumerate(self.members):
-            if self.stack.step and not member.run.policy_path.exists():  # somebody deleted it: the checkpoint has it
-                self.stack.policy(run).save(member.run.policy_path)
-            if self.stack.step and not member.run.losses_path.exists():
-                print(f"offbench: {member.run.losses_path} is gone: its rows begin again here", file=sys.stderr)
-            known, rows = member.run.evaluations(), member.run.losses()
-            # an evaluation at the end of a shorter schedule may lie off this one's grid
-            self.evaluations[run] = {s: e for s, e in known.items() if s <= self.stack.step and self._evaluates_at(s)}
-            self.losses[run] = [row for row in rows if row.get("step", math.inf) <= self.stack.step]
+        for i, run in enumerate(self.runs):
+            if self.stack.step and not run.policy_path.exists():  # somebody deleted it: the checkpoint has it
+                self.stack.policy(i).save(run.policy_path)
+            if self.stack.step and not run.losses_path.exists():
+                print(f"offbench: {run.losses_path} is missing; it starts again at this step", file=sys.stderr)
+            # an evaluation at the end of a shorter training may lie between this one's
+            self.evaluations[i] = {
+                step: episodes
+                for step, episodes in run.evaluations().items()
+                if step <= self.stack.step and self._evaluates_at(step)
+            }
+            self.losses[i] = [row for row in run.losses() if row.get("step", math.inf) <= self.stack.step]
 
     def _checkpoint(self) -> None:
         """Write everything up to now."""
         began = time.monotonic()
         step = self.stack.step
         tensors = {name: tensor.detach().cpu() for name, tensor in self.stack.tensors().items()}
-        for run, member in self._going():
-            folder = member.run.folder
-            with disk_errors(str(folder)):
-                member.run.write_evaluations(self.evaluations[run])
-                member.run.write_losses(self.losses[run])
-                self.stack.policy(run).save(member.run.policy_path)
+        for i, run in self._active():
+            with disk_errors(str(run.folder)):
+                run.write_evaluations(self.evaluations[i])
+                run.write_losses(self.losses[i])
+                self.stack.policy(i).save(run.policy_path)
                 state: dict[str, Any] = {"step": step}
-                unlogged = self.stack.program.unlogged(run)
+                unlogged = self.stack.program.unlogged(i)
                 if unlogged:  # stopped by the clock, between two rows of losses.csv
                     state["unlogged"] = unlogged
-                checkpoints.save_checkpoint(folder, step, slice_of(tensors, run), state)
-                checkpoints.keep_newest(folder)
+                checkpoints.save_checkpoint(run.folder, step, slice_of(tensors, i), state)
+                checkpoints.keep_newest(run.folder)
         self._show()
         self._saved = time.monotonic()
-        self._took = self._saved - began
+        self._save_seconds = self._saved - began
 
     def _show(self) -> None:
         """Send what the last checkpoint keeps to the live views."""
-        for run, _ in self._going():
-            self.loggers.write(run, self.losses[run], self.evaluations[run])
+        for i, _ in self._active():
+            self.loggers.write(i, self.losses[i], self.evaluations[i])
 
     def _evaluate(self) -> None:
-        """Start the evaluation of every run's policy as it is now, unless it is known already."""
+        """Start the evaluation of every run's policy at this step, unless there is one already."""
         step = self.stack.step
         if self.rollouts is None:
             return
-        for run, member in self._going():
+        for i, spec in enumerate(self.job.specs):
             if self.stops:
                 return  # resuming evaluates what is missing at its first step
-            if step not in self.evaluations[run]:
+            if i not in self.diverged and step not in self.evaluations[i]:
                 stream = (int(Purpose.EVALUATION), step)
-                count = self.schedule.eval_episodes
-                policy = self.stack.policy(run)
-                self.pending.append((run, step, self.rollouts.outcomes(policy, member.seed, stream, count, True)))
-
-    def _arrived(self) -> None:
-        """Take in evaluations that are done, without waiting."""
-        if self.pending and all(future.done() for _, _, future in self.pending):
-            self._collect()
+                policy = self.stack.policy(i)
+                self.pending.append(
+                    (i, step, self.rollouts.outcomes(policy, spec.seed, stream, spec.eval_episodes, True))
+                )
 
     def _collect(self) -> None:
-        """Wait for all evaluations under way and write them down."""
-        for run, step, future in self.pending:
-            outcomes = result(future)
-            self.evaluations[run][step] = [(o.ret, o.length) for o in outcomes]
-            self.members[run].run.write_evaluations(self.evaluations[run])
+        """Wait for all evaluations under way and write them to the runs' files."""
+        for i, step, future in self.pending:
+            self.evaluations[i][step] = [(episode.ret, episode.length) for episode in result(future)]
+            self.runs[i].write_evaluations(self.evaluations[i])
         if self.pending:
             self.note = self._score_note(self.pending[0][1])
         self.pending = []
 
     def _score_note(self, step: int) -> str:
-        """Return the mean score of the runs at `step`, normalised if there is a reference."""
-        found = [self.evaluations[run] for run, _ in self._going()]
-        means = [float(np.mean([ret for ret, _ in e[step]])) for e in found if step in e]
+        """Return the mean score of the runs at `step`, or the mean return if the dataset has no references."""
+        evaluations = [self.evaluations[i] for i, _ in self._active()]
+        means = [float(np.mean([ret for ret, _ in e[step]])) for e in evaluations if step in e]
         if not means:
             return ""
-        references = self.members[0].data.references
+        references = self.stack.data[0].references
         if references is None:
             return f"return {np.mean(means):.0f}"
         return f"score {np.mean([normalize(mean, *references) for mean in means]):.1f}"

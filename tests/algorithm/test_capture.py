@@ -12,7 +12,7 @@ from torch import Tensor
 
 from offbench.algorithm import Algorithm, Batch, Logs, Noise
 from offbench.algorithm.capture import NotCapturableError, record
-from offbench.benchmarks.throughput import made_up
+from offbench.benchmarks.throughput import random_stack
 from offbench.common.errors import OffbenchError
 from offbench.common.settings import build, setting
 from offbench.envs.recipes import load_recipe
@@ -24,8 +24,7 @@ from offbench.training.stack import Stack
 
 def stack_of(kind: type, runs: int = 1, **settings: Any) -> Stack:
     config: Any = build(kind.Config, settings, "test")  # type: ignore[attr-defined]
-    member = made_up("test", config, load_recipe("hopper").env_spec())
-    return Stack(kind, [member] * runs, "cpu")
+    return random_stack(kind, [config] * runs, load_recipe("hopper").env_spec())
 
 
 def trained(stack: Stack, steps: int) -> tuple[dict[str, Tensor], list[dict[str, float]]]:

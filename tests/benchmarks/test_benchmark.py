@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import pytest
 
 import offbench
 from offbench.analysis.normalize import score_runs
-from offbench.benchmarks.benchmark import LocalExecutor, benchmark, shared
+from offbench.benchmarks.benchmark import LocalExecutor, benchmark, shard_of
 from offbench.benchmarks.grid import load_grid, shipped_grids
 from offbench.benchmarks.plan import Plan, prepare
 from offbench.benchmarks.throughput import operations
@@ -28,9 +29,9 @@ from offbench.common.errors import OffbenchError
 from offbench.common.settings import fields as settings_of
 from offbench.data import minari_store
 from offbench.envs.recipes import load_recipe
-from offbench.training.jobs import Job
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run, find_runs
+from offbench.training.spec import Job, RunSpec
 from tests.made_runs import made_run
 from tests.speed.arithmetic import ALGORITHMS
 
@@ -71,10 +72,9 @@ def silent(_: str) -> None:
 def test_the_papers_grid_is_its_table() -> None:
     """15 datasets x (TD3+BC, CQL, four BDB) x 5 seeds = 450 runs of a million updates."""
     bench = prepare("paper", workers=1)
-    assert sum(len(bench.orders(one)) for one in bench.variants) == 450
-    assert {one.times.steps for one in bench.variants} == {1_000_000}
-    assert {one.times.eval_every for one in bench.variants} == {5_000}
-    assert [one.name for one in bench.variants] == [
+    assert sum(map(len, bench.variants)) == 450
+    assert {spec.times for specs in bench.variants for spec in specs} == {(1_000_000, 5_000, 10)}
+    assert [specs[0].label for specs in bench.variants] == [
         "td3_bc",
         "bdb beta=0.25",
         "bdb beta=0.5",
@@ -90,7 +90,7 @@ def test_the_papers_grid_is_its_table() -> None:
 def test_shipped_grids_are_sound_and_their_plan_counts_what_is_left(name: str) -> None:
     bench = prepare(name, workers=2)
     first, *lines = Plan(bench)
-    runs = sum(len(bench.orders(one)) for one in bench.variants)
+    runs = sum(map(len, bench.variants))
     datasets = len(bench.grid.datasets)
     words = "1 dataset" if datasets == 1 else f"{datasets} datasets"
     assert first == f"{name}: {words}, {len(bench.variants)} variants, {runs} runs, {runs} to train"
@@ -101,17 +101,18 @@ def test_shipped_grids_are_sound_and_their_plan_counts_what_is_left(name: str) -
 
 @pytest.mark.parametrize(("algorithm", "settings"), [("td3_bc", {}), ("bdb", {}), ("cql", {"bc_steps": 0})])
 def test_the_plans_operations_are_those_counted_by_hand(algorithm: str, settings: dict[str, Any]) -> None:
-    config = load_algorithm(algorithm).Config(**settings)
+    config: Any = load_algorithm(algorithm).Config(**settings)
+    spec = RunSpec(algorithm, config, "any-v0", 0, 1, 1, 1, Path())
     by_hand = ALGORITHMS[algorithm](11, 3, config.batch_size, config.hidden)
     wanted = sum(often * 2 * np.prod([float(size) for size in product]) for often, product in by_hand)
-    counted = operations(algorithm, config, load_recipe("hopper").env_spec())
+    counted = operations(spec, load_recipe("hopper").env_spec())
     assert counted == pytest.approx(wanted, rel=1e-9)
 
 
 def test_a_finished_grid_is_left_alone(grid: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert benchmark(prepare(grid, workers=1), say=silent)
     runs = find_runs(home / "runs")
-    assert {(r.config()["algorithm"], r.config()["seed"], r.config()["steps"]) for r in runs} == {
+    assert {(r.config().algorithm, r.config().seed, r.config().steps) for r in runs} == {
         ("td3_bc", 0, 200),
         ("td3_bc", 1, 200),
         ("bdb", 7, 100),
@@ -167,7 +168,7 @@ def test_the_longest_training_begins_first(grid: str, home: Path) -> None:
 
     class Idle(LocalExecutor):
         def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
-            begun.extend(job.schedule.steps for job in jobs)
+            begun.extend(job.first.steps for job in jobs)
             return []
 
     assert not benchmark(prepare(grid, workers=2), executor=Idle(), say=silent)
@@ -191,13 +192,14 @@ def test_shards_share_the_runs_and_together_are_the_grid(grid: str, home: Path) 
 @pytest.mark.parametrize("count", [2, 7, 16])
 def test_shares_of_the_papers_grid_are_even_and_leave_none_out(count: int) -> None:
     bench = prepare("paper", workers=1)
-    whole = sorted(order.folder for one in bench.variants for order in bench.orders(one))
-    shares = [[order.folder for orders in shared(bench, (i, count)) for order in orders] for i in range(count)]
+    whole = sorted(spec.folder for specs in bench.variants for spec in specs)
+    shares = [[spec.folder for spec in shard_of(bench, (i, count))] for i in range(count)]
     assert sorted(folder for share in shares for folder in share) == whole
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
     for i in range(count):
-        of_each = [len(orders) for orders in shared(bench, (i, count))]
-        assert max(of_each) - min(of_each) <= 1  # some of every algorithm
+        of_each = Counter(spec.label for spec in shard_of(bench, (i, count)))
+        assert len(of_each) == len(bench.variants)  # some of every algorithm
+        assert max(of_each.values()) - min(of_each.values()) <= 1
 
 
 def test_a_recipe_is_found_beside_its_grid_then_from_here(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -213,7 +215,7 @@ def test_a_recipe_is_found_beside_its_grid_then_from_here(home: Path, monkeypatc
 
 def test_layers_may_be_written_as_folders_name_them(grid: str, home: Path) -> None:
     (home / "grid.toml").write_text((home / "grid.toml").read_text().replace("[16, 16]", '"16x16"'))
-    assert {one.config.hidden for one in prepare(grid, workers=1).variants} == {(16, 16)}
+    assert {specs[0].config.hidden for specs in prepare(grid, workers=1).variants} == {(16, 16)}
 
 
 BAD: dict[str, tuple[str, str]] = {
@@ -353,9 +355,11 @@ def test_a_list_is_a_variant_for_each_value_of_any_setting(tmp_path: Path) -> No
         'beta = [0.5, "adaptive"]\nbatch_size = [16, 32]\nhidden = [[8, 8], [16]]\ndiscriminator_hidden = [4, 4]'
     )
     grid.write_text(f'datasets = ["hopper-medium-v0"]\n[[algorithms]]\nname = "bdb"\n{settings}')
-    found = {(v.config.beta, v.config.batch_size, v.config.hidden) for v in prepare(str(grid)).variants}
-    assert found == set(itertools.product((0.5, "adaptive"), (16, 32), ((8, 8), (16,))))
-    assert {v.config.discriminator_hidden for v in prepare(str(grid)).variants} == {(4, 4)}
+    configs = [specs[0].config for specs in prepare(str(grid)).variants]
+    assert {(config.beta, config.batch_size, config.hidden) for config in configs} == set(
+        itertools.product((0.5, "adaptive"), (16, 32), ((8, 8), (16,)))
+    )
+    assert {config.discriminator_hidden for config in configs} == {(4, 4)}
 
 
 def test_values_that_make_separate_stacks_train_in_one_command(medium: str) -> None:

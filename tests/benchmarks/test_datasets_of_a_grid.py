@@ -90,6 +90,7 @@ def test_datasets_of_an_older_ladder_are_named(
     assert "warning" not in capsys.readouterr().err
     # a shorter ladder of the same training: another expert
     shorter = behaviour(recipe, steps=1600, workers=1)
+    warn_other_references(recipe, shorter)
     assert shorter.expert_return != ladder.expert_return
     said = capsys.readouterr().err
     assert f"scores of tiny are now from {shorter.random_return:.1f} to {shorter.expert_return:.1f}" in said

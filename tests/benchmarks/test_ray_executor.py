@@ -17,10 +17,11 @@ from offbench.benchmarks.benchmark import benchmark
 from offbench.benchmarks.grid import load_grid
 from offbench.benchmarks.plan import prepare
 from offbench.common.errors import OffbenchError
-from offbench.training.grouping import cut, pending
-from offbench.training.jobs import Order
+from offbench.training.devices import Machine
+from offbench.training.registry import load_algorithm
 from offbench.training.run import Run, find_runs
-from offbench.training.trainer import Schedule
+from offbench.training.spec import RunSpec
+from offbench.training.train import Training
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
 
@@ -90,19 +91,19 @@ def test_a_lost_node_changes_nothing(two_nodes: Any, home: Path) -> None:
 
 def test_a_slice_begins_when_its_task_does(home: Path, medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A task dealt out a minute ago, with slices of half a minute, trains to its end all the same."""
-    held = SimpleNamespace(remote=lambda **_: lambda task: SimpleNamespace(remote=lambda *words: (task, words)))
+    fake = SimpleNamespace(remote=lambda **_: lambda task: SimpleNamespace(remote=lambda *words: (task, words)))
     executor = object.__new__(ray_executor.RayExecutor)
-    executor.ray, executor.slice, executor._retried = held, 30.0, {}
-    executor.shelf = SimpleNamespace(report=SimpleNamespace(remote=lambda *_: None))
-    order = Order("td3_bc", medium, {"hidden": (16, 16)}, 0, str(home / "runs" / medium / "td3_bc/default/seed-0"))
-    schedule = Schedule(1_000, 1_000, 1, "cpu", workers=0)
-    (job,) = pending(cut([order], "cpu", 1, 1)[0], schedule)
+    executor.ray, executor.slice, executor._options = fake, 30.0, {}
+    executor.server = SimpleNamespace(report=SimpleNamespace(remote=lambda *_: None))
+    config: Any = load_algorithm("td3_bc").Config(hidden=(16, 16))
+    spec = RunSpec("td3_bc", config, medium, 0, 1_000, 1_000, 1, home / "runs" / medium / "td3_bc/default/seed-0")
+    (job,) = Training([spec], Machine("cpu", 1)).jobs
     with ray_executor._token(home) as token:
         with monkeypatch.context() as patched:
             patched.setattr(ray_executor, "time", SimpleNamespace(time=lambda: time.time() - 60))
             task, words = executor._start(job, 0, token)
         assert task(*words) == (True, [])
-    assert not ray_executor.left(job)
+    assert not ray_executor.unfinished(job)
 
 
 def test_nodes_that_share_no_disk_fetch_and_bring_back(

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import time
+from pathlib import Path
 
 import pytest
 
 from offbench.common import progress
-from offbench.training.jobs import Board, Job, Order
-from offbench.training.trainer import Schedule
+from offbench.training.jobs import JobProgress
+from offbench.training.spec import Job, RunSpec
 
 
 class Clock:
@@ -29,8 +30,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def job(algorithm: str, runs: int, steps: int, cost: float) -> Job:
-    orders = tuple(Order(algorithm, "x-v0", {}, seed, "") for seed in range(runs))
-    return Job(algorithm, orders, Schedule(steps, 100, 1, "cpu", workers=0), cost=cost)
+    specs = tuple(RunSpec(algorithm, None, "x-v0", seed, steps, 100, 1, Path()) for seed in range(runs))
+    return Job(specs, "cpu", cost=cost)
 
 
 def last_line(capsys: pytest.CaptureFixture[str]) -> str:
@@ -38,16 +39,16 @@ def last_line(capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def test_what_is_slow_is_still_to_come(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
-    with Board([job("td3_bc", 2, 1000, 0.1), job("cql", 1, 100, 3.0)]) as board:
-        board.heard(0, 0, "")
+    with JobProgress([job("td3_bc", 2, 1000, 0.1), job("cql", 1, 100, 3.0)]) as bar:
+        bar.report(0, 0, "")
         clock.now = 100.0
-        board.heard(0, 1000, "")
+        bar.report(0, 1000, "")
         # 2000 updates of 0.1 in 100 s: 2 units of work a second, and 300 are left
         assert last_line(capsys) == "3 runs: 2,000/2,100 steps, 20 steps/s, 2 min 30 s left"
         clock.now = 200.0
-        board.heard(1, 50, "score 7")  # gone on from there: 150 of the 300 were done before
+        bar.report(1, 50, "score 7")  # resumed there: 150 of the 300 were done before
         clock.now = 250.0
-        board.heard(1, 60, "")
+        bar.report(1, 60, "")
         # 230 units in 250 s, 120 left
         assert last_line(capsys) == "3 runs: 2,060/2,100 steps, 8 steps/s, 2 min 10 s left, score 7"
 

@@ -22,7 +22,8 @@ from offbench.common.errors import OffbenchError
 from offbench.common.settings import setting
 from offbench.common.text import no_formula, printable
 from offbench.training import registry
-from offbench.training.run import Run, find_runs, variant
+from offbench.training.run import Run, find_runs
+from offbench.training.spec import variant
 from tests.cli.test_bad_input import refusal
 
 ROWS = "step,episode,return,length\n100,0,1.0,5\n100,1,2.0,5\n200,0,3.0,5\n200,1,4.0,5\n"

@@ -189,7 +189,7 @@ def test_training_survives_kill_9_at_any_moment(
         assert warm.run(words, folder)["status"] == 0
         (run,) = find_runs(folder / "runs")
         assert {name: (run.folder / name).read_bytes() for name in names} == wanted
-        assert run.config()["dataset_sha256"] == right.config()["dataset_sha256"]
+        assert run.config().dataset_sha256 == right.config().dataset_sha256
 
     trials(warm, words, "train", home, monkeypatch, prepare, look)
     assert KILLS["train"] < 100 or {0, 40, 80} <= set(last)  # killed early and late

@@ -9,7 +9,6 @@ machine that is lent for minutes at a time is enough. On a CPU it does the same 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import datetime
 import json
 import time
@@ -19,7 +18,7 @@ from typing import Any
 
 import torch
 
-from offbench.benchmarks.throughput import made_up
+from offbench.benchmarks.throughput import random_stack
 from offbench.common.files import write_json
 from offbench.common.provenance import versions
 from offbench.common.settings import build
@@ -39,12 +38,11 @@ def stack_of(algorithm: str, runs: int, device: str, *, captured: bool = True, *
     settings = {"hidden": "256,256"} | ({"bc_steps": 0} if algorithm == "cql" else {}) | settings
     betas = [0.0, 0.25, 0.5, 0.75, "adaptive"] if algorithm == "bdb" else [None]
     spec = load_recipe("hopper").env_spec()
-    member = made_up(algorithm, build(kind.Config, settings, algorithm), spec)
-    members = []
+    configs = []
     for seed in range(runs):
         own = settings if betas[0] is None else settings | {"beta": betas[seed % len(betas)]}
-        members.append(dataclasses.replace(member, seed=seed, config=build(kind.Config, own, algorithm)))
-    stack = Stack(kind, members, device)
+        configs.append(build(kind.Config, own, algorithm))
+    stack = random_stack(kind, configs, spec, device)
     if not captured:
         stack.program._side = None
     return stack

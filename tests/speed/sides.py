@@ -31,7 +31,7 @@ def train(
     def work() -> int:
         for _ in stack.train(stack.step + few):
             pass
-        return few * len(stack.members)
+        return few * len(stack.specs)
 
     return work
 
@@ -40,24 +40,16 @@ def stack_of(
     algorithm: str, runs: int = 1, rows: int = 100_000, hidden: str = "256,256", precision: str = "float32"
 ) -> Stack:
     """A stack on random transitions of hopper's shapes."""
+    from offbench.benchmarks.throughput import random_stack
     from offbench.common.settings import build
+    from offbench.envs.recipes import load_recipe
     from offbench.training.devices import arithmetic
     from offbench.training.registry import load_algorithm
-    from offbench.training.stack import Stack
 
     ARITHMETIC.enter_context(arithmetic("cpu", precision))
     kind = load_algorithm(algorithm)
     config: Any = build(kind.Config, {"hidden": hidden} | ({"bc_steps": 0} if algorithm == "cql" else {}), algorithm)
-    return Stack(kind, [_member(algorithm, config, rows)] * runs, "cpu")
-
-
-def _member(algorithm: str, config: Any, rows: int) -> Any:
-    """A run on random transitions of hopper's shapes."""
-    from offbench.benchmarks import throughput
-    from offbench.envs.recipes import load_recipe
-
-    throughput.ROWS = rows
-    return throughput.made_up(algorithm, config, load_recipe(ENV).env_spec())
+    return random_stack(kind, [config] * runs, load_recipe(ENV).env_spec(), rows=rows)
 
 
 def record(workers: str) -> Work:

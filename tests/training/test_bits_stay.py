@@ -6,7 +6,6 @@ AMD EPYC. `python -m tests.training.test_bits_stay` writes it anew, which is rig
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,12 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from offbench.benchmarks.throughput import made_up
+from offbench.benchmarks.throughput import random_stack
 from offbench.common.provenance import hardware
 from offbench.common.settings import build
 from offbench.envs.recipes import load_recipe
 from offbench.training.devices import arithmetic
 from offbench.training.registry import load_algorithm
-from offbench.training.stack import Stack
 
 STORED = Path(__file__).parent.parent / "fixtures" / "earlier" / "variants.safetensors"
 UPDATES = 24
@@ -51,8 +49,7 @@ def learned(case: str) -> dict[str, Tensor]:
     kind = load_algorithm(algorithm)
     small = SMALL | ({"discriminator_hidden": (8, 8)} if algorithm.startswith("bdb") else {})
     config = build(kind.Config, small | settings, case)
-    member = made_up(algorithm, config, load_recipe("hopper").env_spec())
-    stack = Stack(kind, [member, replace(member, seed=1)], "cpu")
+    stack = random_stack(kind, [config, config], load_recipe("hopper").env_spec())
     with arithmetic("cpu"):
         for _ in stack.train(UPDATES):
             pass

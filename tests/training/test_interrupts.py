@@ -90,7 +90,7 @@ def test_ctrl_c_and_sigterm_save_a_checkpoint_where_they_arrive(
     assert "stopped at step 300, checkpoint saved" in (said := capsys.readouterr().err)
     assert "the same command goes on" in said
     main(words)
-    assert "going on from step 300" in capsys.readouterr().err
+    assert "resuming from step 300" in capsys.readouterr().err
     assert_same_files(run, whole)
 
 

@@ -17,29 +17,34 @@ import offbench
 from offbench.cli.main import main
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
-from offbench.training.grouping import cut, pending
-from offbench.training.jobs import Job, Order, perform
+from offbench.training.devices import pick_machine
+from offbench.training.jobs import train_job
+from offbench.training.registry import load_algorithm
 from offbench.training.run import Run
-from offbench.training.trainer import Schedule
+from offbench.training.spec import Job, RunSpec, configurations
+from offbench.training.train import Training
 from tests.data.test_transitions import episode, foreign
 
 SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32}
 TIMES: dict[str, Any] = {"eval_every": 100, "eval_episodes": 2}
 
 
-def orders(dataset: str, runs: str, seeds: int, algorithm: str = "bdb", **settings: Any) -> list[Order]:
-    known = {"hidden": [16, 16], "batch_size": 32} | settings
-    name = "-".join(f"{key}={value}" for key, value in settings.items())
-    return [Order(algorithm, dataset, known, seed, f"{runs}/{algorithm}{name}/{seed}") for seed in range(seeds)]
+def specs(
+    dataset: str, runs: str, seeds: int, times: tuple[int, int], algorithm: str = "bdb", **settings: Any
+) -> list[RunSpec]:
+    """Specs of seeds 0, 1, ...; `times` are steps and eval_every."""
+    (config,) = configurations(load_algorithm(algorithm).Config, {"hidden": (16, 16), "batch_size": 32} | settings, "")
+    folder = Path(runs) / (algorithm + "-".join(f"{key}={value}" for key, value in settings.items()))
+    return [RunSpec(algorithm, config, dataset, seed, *times, 2, folder / str(seed)) for seed in range(seeds)]
 
 
-def jobs_of(orders: list[Order], schedule: Schedule, processes: int, stack: int | str = "auto") -> list[Job]:
-    return [job for part in cut(orders, "cpu", processes, stack) for job in pending(part, schedule)]
+def jobs_of(specs: list[RunSpec], processes: int, stack: int | str = "auto") -> list[Job]:
+    return Training(specs, pick_machine("cpu", processes, stack, "float32")).jobs
 
 
 def finish(jobs: list[Job]) -> None:
     for job in jobs:
-        assert perform(job, lambda step, note: None) == []
+        assert train_job(job, lambda step, note: None) == []
 
 
 @pytest.mark.slow
@@ -53,23 +58,19 @@ def test_two_processes_train_what_one_does(medium: str) -> None:
 
 
 def test_a_deadline_within_a_training_changes_no_file(medium: str, home: Path) -> None:
-    schedule = Schedule(400, 400, 2, "cpu", 0)
-    finish(jobs_of(orders(medium, "whole", 2), schedule, 1))
-    over = replace(schedule, deadline=0.0)  # looked at every 100 updates
+    whole, stopped = (specs(medium, runs, 2, (400, 400)) for runs in ("whole", "stopped"))
+    finish(jobs_of(whole, 1))
     for step in (100, 200, 300, 400):
-        finish(jobs_of(orders(medium, "cut", 2), over, 1))
-        assert all(checkpoints.steps(Path(order.folder))[0] == step for order in orders(medium, "cut", 2))
-    for one, other in zip(orders(medium, "whole", 2), orders(medium, "cut", 2), strict=True):
+        finish([replace(job, deadline=0.0) for job in jobs_of(stopped, 1)])  # which is checked every 100 updates
+        assert all(checkpoints.steps(spec.folder)[0] == step for spec in stopped)
+    for one, other in zip(whole, stopped, strict=True):
         for name in ("evaluations.csv", "losses.csv", "policy.safetensors", "checkpoint-000000400.safetensors"):
-            assert (Path(one.folder) / name).read_bytes() == (Path(other.folder) / name).read_bytes(), name
+            assert (one.folder / name).read_bytes() == (other.folder / name).read_bytes(), name
 
 
 def test_stacks_are_cut_for_the_processes_and_by_size(medium: str) -> None:
-    schedule = Schedule(100, 100, 2, "cpu", 0)
-
     def sizes(count: int, processes: int, stack: int | str = "auto") -> list[int]:
-        jobs = jobs_of(orders(medium, "runs", count), schedule, processes, stack=stack)
-        return [len(job.orders) for job in jobs]
+        return [len(job.specs) for job in jobs_of(specs(medium, "runs", count, (100, 100)), processes, stack)]
 
     assert sizes(5, 1) == [5]
     assert sizes(5, 2) == [3, 2]
@@ -82,10 +83,11 @@ def test_stacks_are_cut_for_the_processes_and_by_size(medium: str) -> None:
 
 
 def test_what_cannot_differ_within_a_stack_makes_stacks_of_its_own(medium: str) -> None:
-    schedule = Schedule(100, 100, 2, "cpu", 0)
-    mixed = orders(medium, "runs", 2, beta=0.5) + orders(medium, "runs", 1, beta="adaptive")
-    mixed += orders(medium, "runs", 2, critics=3) + orders(medium, "runs", 1, algorithm="td3_bc")
-    assert [len(job.orders) for job in jobs_of(mixed, schedule, 1)] == [3, 2, 1]
+    where = (medium, "runs")
+    mixed = specs(*where, 2, (100, 100), beta=0.5) + specs(*where, 1, (100, 100), beta="adaptive")
+    mixed += specs(*where, 2, (100, 100), critics=3) + specs(*where, 1, (100, 100), algorithm="td3_bc")
+    mixed += specs(*where, 1, (200, 100), beta=0.25)
+    assert [len(job.specs) for job in jobs_of(mixed, 1)] == [3, 2, 1, 1]
 
 
 def test_another_environment_makes_a_stack_of_its_own(medium: str, home: Path) -> None:
@@ -95,17 +97,16 @@ def test_another_environment_makes_a_stack_of_its_own(medium: str, home: Path) -
     metadata = json.loads(path.read_text())
     spec = json.loads(metadata["eval_env_spec"]) | {"max_episode_steps": 500}
     path.write_text(json.dumps(metadata | {"eval_env_spec": json.dumps(spec), "dataset_id": "longer-v0"}))
-    both = orders(medium, "runs", 2) + orders("longer-v0", "longer", 1)
-    jobs = jobs_of(both, Schedule(100, 100, 2, "cpu", 0), 1)
-    assert [{order.dataset for order in job.orders} for job in jobs] == [{medium}, {"longer-v0"}]
+    both = specs(medium, "runs", 2, (100, 100)) + specs("longer-v0", "longer", 1, (100, 100))
+    assert [{spec.dataset for spec in job.specs} for job in jobs_of(both, 1)] == [{medium}, {"longer-v0"}]
 
 
 def test_a_stack_that_goes_on_has_the_same_runs_as_before(medium: str) -> None:
-    """Of two stacks of two, one is done: the other is not cut anew to fill the processes."""
-    schedule = Schedule(200, 100, 2, "cpu", 0)
-    finish(jobs_of(orders(medium, "runs", 4), schedule, 2)[:1])
-    (job,) = jobs_of(orders(medium, "runs", 4), schedule, 2)
-    assert [order.seed for order in job.orders] == [2, 3]
+    """Of two stacks of two, one is done: the other is not split to fill the processes."""
+    runs = specs(medium, "runs", 4, (200, 100))
+    finish(jobs_of(runs, 2)[:1])
+    (job,) = jobs_of(runs, 2)
+    assert [spec.seed for spec in job.specs] == [2, 3]
 
 
 def test_a_run_that_diverges_is_marked_and_the_others_go_on(medium: str) -> None:
@@ -130,7 +131,7 @@ def test_several_networks_in_one_command(medium: str, capsys: pytest.CaptureFixt
     words = ["--steps", "2", "--eval-every", "2", "--eval-episodes", "1", "--workers", "1"]
     main(["train", "bc", "--dataset", medium, *words, "--hidden", "8,8", "16x16", "--runs", "my runs"])
     *folders, hint = capsys.readouterr().out.splitlines()
-    assert [Run(Path(folder)).config()["settings"]["hidden"] for folder in folders] == [[8, 8], [16, 16]]
+    assert [Run(Path(folder)).config().settings["hidden"] for folder in folders] == [[8, 8], [16, 16]]
     main(shlex.split(hint.removeprefix("next: offbench ")))  # as it can be pasted
     assert "hidden=16x16" in capsys.readouterr().out
 
@@ -144,7 +145,7 @@ def test_any_number_of_settings_has_a_folder(medium: str) -> None:
     folders = offbench.train("bdb_plus", medium, **more)
     assert len(set(folders)) == 2
     assert all(len(part.encode()) <= 255 for folder in folders for part in folder.parts)
-    variants = [Run(folder).config()["variant"] for folder in folders]
+    variants = [Run(folder).config().variant for folder in folders]
     assert ["penalty_weight=2," in variants[0], "penalty_weight=3," in variants[1]] == [True, True]
     assert offbench.train("bdb_plus", medium, **more) == folders  # finished already
     found = offbench.compare(*[f"bdb_plus/{folder.parent.name}" for folder in folders])

@@ -1,0 +1,233 @@
+"""What is to be trained: one run (RunSpec), and a group of runs that train together (Job).
+
+grid or command -> specs_of -> RunSpec -> group -> Job -> train_job (offbench.training.jobs)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from offbench.common.errors import OffbenchError, unknown
+from offbench.common.files import sha256
+from offbench.common.settings import check, fields, setting
+from offbench.training.loggers import NOWHERE, Destinations
+from offbench.training.registry import load_algorithm
+from offbench.training.run import Run
+
+LONGEST = 255  # bytes of a file's name, on the usual file systems
+
+
+@dataclass(frozen=True)
+class Times:
+    """The seeds of an algorithm's runs, how long each trains and when it is evaluated."""
+
+    seeds: tuple[int, ...] = (0,)
+    steps: int = setting(1_000_000, "updates", low=1)
+    eval_every: int = setting(5_000, "updates between evaluations", low=1)
+    eval_episodes: int = setting(10, "episodes per evaluation", low=1)
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """One run that is to be trained.
+
+    Attributes:
+        algorithm: its registered name.
+        config: the algorithm's settings, an instance of its `Config`.
+        dataset: the id of a local Minari dataset.
+        steps: updates of the whole run.
+        eval_every, eval_episodes: updates between evaluations, and episodes per evaluation.
+        folder: the run's folder.
+        precision: of matrix products.
+    """
+
+    algorithm: str
+    config: Any
+    dataset: str
+    seed: int
+    steps: int
+    eval_every: int
+    eval_episodes: int
+    folder: Path
+    precision: str = "float32"
+
+    @property
+    def run(self) -> Run:
+        """The run's folder with its files."""
+        return Run(self.folder)
+
+    @property
+    def variant(self) -> str:
+        """The settings that differ from their defaults."""
+        return variant(self.config, self.precision)
+
+    @property
+    def label(self) -> str:
+        """Algorithm and settings as a table shows them: `bdb beta=0.5`."""
+        return f"{self.algorithm} {variant(self.config)}".removesuffix(" default")
+
+    @property
+    def times(self) -> tuple[int, int, int]:
+        """What runs of one job must share beside their algorithm: steps, eval_every, eval_episodes."""
+        return self.steps, self.eval_every, self.eval_episodes
+
+
+@dataclass(frozen=True)
+class Job:
+    """A group of runs that train as one program, in one process.
+
+    Attributes:
+        specs: the runs; algorithm, times, precision and environment are the same for all.
+        device: PyTorch's name of it.
+        workers: evaluation processes; 0 evaluates in the training process.
+        deadline: `time.time()` after which the job stops at the next chunk, with a checkpoint; None for never.
+        show: live views of the training.
+        cost: seconds per update of one run, relative to the other jobs, for the time left.
+    """
+
+    specs: tuple[RunSpec, ...]
+    device: str
+    workers: int = 0
+    deadline: float | None = None
+    show: Destinations = NOWHERE
+    cost: float = 1.0
+
+    @property
+    def first(self) -> RunSpec:
+        """The first run, for what all runs share."""
+        return self.specs[0]
+
+    @property
+    def updates(self) -> int:
+        """Updates of all its runs together."""
+        return len(self.specs) * self.first.steps
+
+    @property
+    def work(self) -> float:
+        """The cost of all updates, relative to the other jobs."""
+        return self.updates * self.cost
+
+    @property
+    def title(self) -> str:
+        """The job in messages."""
+        runs = f" ({len(self.specs)} runs)" if len(self.specs) > 1 else ""
+        return f"{self.first.algorithm} on {self.first.dataset}{runs}"
+
+
+def specs_of(
+    algorithm: str,
+    settings: Mapping[str, Any],
+    datasets: Sequence[str],
+    times: Times,
+    runs: Path,
+    precision: str = "float32",
+) -> list[tuple[RunSpec, ...]]:
+    """Return the runs of one algorithm on datasets: a tuple per combination of settings (variant).
+
+    Args:
+        settings: values by name; a list of values is varied.
+        runs: the folder of all run folders.
+
+    Raises:
+        OffbenchError: an unknown algorithm or setting, or a bad value.
+    """
+    variants = []
+    for config in configurations(load_algorithm(algorithm).Config, settings, algorithm):
+        name = variant(config, precision)
+        variants.append(
+            tuple(
+                RunSpec(
+                    algorithm,
+                    config,
+                    dataset,
+                    seed,
+                    times.steps,
+                    times.eval_every,
+                    times.eval_episodes,
+                    run_folder(runs, dataset, algorithm, name, seed),
+                    precision,
+                )
+                for dataset, seed in itertools.product(datasets, times.seeds)
+            )
+        )
+    return variants
+
+
+def configurations(cls: type, settings: Mapping[str, Any], algorithm: str) -> list[Any]:
+    """Return the different configs of the product of all lists in `settings`. Raises OffbenchError for a bad one."""
+    valid, columns = fields(cls), []
+    for name, value in settings.items():
+        if name not in valid:
+            raise unknown(f"setting of {algorithm}", name, valid)
+        values = list(value) if _is_varied(value, valid[name].default) else [value]
+        if not values:
+            raise OffbenchError(f"{algorithm}: {name} is an empty list")
+        if len(values) > 1 and isinstance(valid[name].default, tuple):
+            _check_lists(values, f"{algorithm}: {name}")
+        columns.append([(name, check(cls, name, item, algorithm)) for item in values])
+    return list(dict.fromkeys(cls(**dict(row)) for row in itertools.product(*columns)))
+
+
+def _is_varied(value: Any, default: Any) -> bool:
+    """Return whether a list holds values of a setting, rather than being one value, as (64, 64) is of `hidden`."""
+    if not isinstance(value, list | tuple):
+        return False
+    return not isinstance(default, tuple) or any(isinstance(item, list | tuple | str) for item in value)
+
+
+def _check_lists(values: Sequence[Any], what: str) -> None:
+    """Refuse `64 64`, which may mean one network of two layers or two of one."""
+    if any(isinstance(item, str) and not re.search("[,x]", item) for item in values):
+        typed = [str(item) for item in values]
+        raise OffbenchError(
+            f"{what} takes lists such as 32,32 64,64, not {' '.join(typed)}; one list is {','.join(typed)}"
+        )
+
+
+def run_folder(root: Path, dataset_id: str, algorithm: str, variant: str, seed: int) -> Path:
+    """Return runs/<dataset>/<algorithm>/<variant>/seed-<n>; a long variant is cut and ends in its hash."""
+    return root / dataset_id / algorithm / folder_name(variant) / f"seed-{seed}"
+
+
+def folder_name(variant: str) -> str:
+    """Return the name of a variant's folder: the variant itself, if a file system takes a name that long."""
+    if len(variant.encode()) <= LONGEST:
+        return variant
+    ending = f"...{sha256(variant.encode())[:16]}"
+    return variant.encode()[: LONGEST - len(ending)].decode(errors="ignore") + ending
+
+
+def variant(config: Any, precision: str = "float32") -> str:
+    """Name a config by the settings that differ from their defaults: `default` or `alpha=1,beta=0.5`.
+
+    A precision other than float32 is the last of them: `beta=0.5,precision=bfloat16`.
+    """
+    parts = []
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if value != field.default:
+            parts.append(f"{field.name}={_setting_text(value)}")
+    if precision != "float32":
+        parts.append(f"precision={precision}")
+    return ",".join(parts) or "default"
+
+
+def _setting_text(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "x".join(str(item) for item in value)
+    if isinstance(value, float):
+        return short if float(short := f"{value:g}") == value else repr(value)
+    return quote(value, safe="") if isinstance(value, str) else str(value).lower()
+
+
+def settings_json(config: Any) -> dict[str, Any]:
+    """Return a config as config.json stores it (tuples become lists)."""
+    values: Mapping[str, Any] = dataclasses.asdict(config)
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
