@@ -31,6 +31,7 @@ from offbench.common.files import csv_bytes, disk_errors, read_json, write_bytes
 from offbench.common.provenance import versions
 from offbench.common.seeds import Purpose
 from offbench.envs.environments import make_env
+from offbench.envs.recipes import Recipe
 from offbench.rollouts.policy import Policy, load_policy, uniform
 from offbench.rollouts.rollouts import MEASURES, Outcome, Rollouts, result, summary
 
@@ -188,11 +189,11 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
     with Rollouts(spec, workers) as rollouts:
         evaluator = RungEvaluator(folder, rows, [s for s in folder.policy_steps() if s <= steps], rollouts)
         episodes = folder.recipe.measure.reference_episodes
-        random = _random_policy(spec, folder.recipe.env_id)
-        references = {"random": summary(evaluator.run(random, (int(Purpose.REFERENCE), 0), episodes))}
+        references = {"random": random_reference(folder.recipe, folder.seed, rollouts)}
         expert = evaluator.expert()
         policy = load_policy(folder.policy(expert))
-        references["expert"] = summary(evaluator.run(policy, (int(Purpose.REFERENCE), 1), episodes))
+        outcomes = evaluator.run(policy, (int(Purpose.REFERENCE), 1), episodes)
+        references["expert"] = summary(outcomes) | {"episodes": episodes}
         worst, best = references["random"]["return"], references["expert"]["return"]
         if best <= worst:
             raise OffbenchError(
@@ -214,7 +215,7 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
         "command": command,
         "steps": steps,
         "hours": rows[-1]["hours"],
-        "references": {name: values | {"episodes": episodes} for name, values in references.items()},
+        "references": references,
         "levels": {"medium": medium, "expert": expert},
     }
     _write(folder, out, rows, evaluator, roles, info)
@@ -223,12 +224,16 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
     return ladder
 
 
-def _random_policy(spec: str, env_id: str) -> Policy:
-    env = make_env(spec)
+def random_reference(recipe: Recipe, seed: int, rollouts: Rollouts) -> dict[str, float]:
+    """Measure the return of uniform actions over the recipe's `reference_episodes`: the reference's 0."""
+    env = make_env(recipe.env_spec())
     space, dim = env.action_space, env.observation_space.shape
     env.close()
     assert dim is not None
-    return uniform(space.low, space.high, dim[0], env_id)  # type: ignore[attr-defined]
+    policy = uniform(space.low, space.high, dim[0], recipe.env_id)  # type: ignore[attr-defined]
+    episodes = recipe.measure.reference_episodes
+    outcomes: list[Outcome] = result(rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 0), episodes, False))
+    return summary(outcomes) | {"episodes": episodes}
 
 
 def _write(

@@ -2,7 +2,7 @@
 
     ladder.json  ladder.csv  policies/*.safetensors  medium-replay.hdf5        (built by offbench.agents.build_ladder)
 
-Returns are of the sampling policy, normalised between the uniform-random and the expert reference.
+Returns are of the sampling policy, normalized between the uniform-random and the expert reference.
 """
 
 from __future__ import annotations
@@ -27,8 +27,10 @@ from offbench.envs.same_physics import warn_other_physics
 from offbench.rollouts.policy import Policy, load_policy
 
 BEHAVIOUR = Path("behaviour")  # where trainings live unless the user says otherwise
-MEDIUM = 1 / 3  # of the expert's normalised return
+MEDIUM = 1 / 3  # of the expert's normalized return
 MEDIUM_AT_MOST = 0.45  # a rung beyond this is no medium while there is another
+MEDIUM_LIMITS = (0.15, 0.6)  # a medium beyond these is recorded only if the user accepts it
+NEAR = 0.05  # a rung this near a wanted fraction is taken for it; others only if the user accepts them
 POLICY_NAME = re.compile(r"\w[\w.-]*\.safetensors")  # a file of the ladder's own folder, nothing else
 REFERENCE = ("return", "low", "high", "episodes")  # what each reference must have
 
@@ -65,12 +67,18 @@ class Ladder:
         return float(self.info["references"]["expert"]["return"])
 
     def fraction(self, rung: Rung) -> float:
-        """Return a rung's normalised return, 1 for the expert's."""
+        """Return a rung's normalized return, 1 for the expert's."""
         return normalize(rung.ret, self.random_return, self.expert_return) / 100
 
     def nearest(self, fraction: float) -> Rung:
-        """Return the kept rung whose measured normalised return lies nearest `fraction`."""
+        """Return the kept rung whose measured normalized return lies nearest `fraction`."""
         return min(self.rungs, key=lambda rung: abs(self.fraction(rung) - fraction))
+
+    def neighbors(self, fraction: float) -> list[Rung]:
+        """Return the rungs next to `fraction`: the nearest below it and the nearest above, if there are."""
+        below = [rung for rung in self.rungs if self.fraction(rung) <= fraction]
+        above = [rung for rung in self.rungs if self.fraction(rung) > fraction]
+        return [*sorted(below, key=self.fraction)[-1:], *sorted(above, key=self.fraction)[:1]]
 
     def role(self, role: str) -> Rung:
         """Return the rung that is `medium` or `expert`."""
@@ -105,9 +113,9 @@ def read_ladder(folder: Path) -> Ladder | None:
         with open(folder / "ladder.csv", newline="", encoding="utf-8", opener=regular) as file:
             rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
         ladder = Ladder(folder, info, rungs)
-        known = [float(info["references"][name][key]) for name in ("random", "expert") for key in REFERENCE]
-        known += [int(info["medium_replay"]["transitions"]), int(info["levels"]["medium"])]
-        if not (np.isfinite(known).all() and ladder.role("medium") and ladder.role("expert")):
+        numbers = [float(info["references"][name][key]) for name in ("random", "expert") for key in REFERENCE]
+        numbers += [int(info["medium_replay"]["transitions"]), int(info["levels"]["medium"])]
+        if not (np.isfinite(numbers).all() and ladder.role("medium") and ladder.role("expert")):
             raise ValueError("its references are not numbers")
         if not ladder.random_return < ladder.expert_return or not isinstance(info["medium_replay"]["sha256"], str):
             raise ValueError("its references are out of order, or medium-replay has no hash")
@@ -130,25 +138,25 @@ def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool =
         OffbenchError: it is damaged, or of another environment.
     """
     shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder and not retrain else None
-    found = shipped or read_ladder(folder_of(recipe, 0, behaviour_dir) / "ladder")
-    if found is None:
+    ladder = shipped or read_ladder(folder_of(recipe, 0, behaviour_dir) / "ladder")
+    if ladder is None:
         return None
-    found.check(recipe)
+    ladder.check(recipe)
     if not shipped:
-        print(f"offbench: using the behaviour agent trained here: {found.folder}", file=sys.stderr)
-        _warn_other_recipe(found, recipe)
-    warn_other_physics(f"the behaviour agent of {recipe.name}", found.info.get("versions", {}), recipe.env_spec())
-    return found
+        print(f"offbench: using the behaviour agent trained here: {ladder.folder}", file=sys.stderr)
+        _warn_other_recipe(ladder, recipe)
+    warn_other_physics(f"the behaviour agent of {recipe.name}", ladder.info.get("versions", {}), recipe.env_spec())
+    return ladder
 
 
 def _warn_other_recipe(ladder: Ladder, recipe: Recipe) -> None:
     """Say which settings of the recipe have been changed since the agent was trained."""
-    known, wanted = ladder.info.get("sac"), json.loads(json.dumps(dataclasses.asdict(recipe.sac)))
-    changed = [key for key, value in wanted.items() if isinstance(known, dict) and known.get(key, value) != value]
+    used, wanted = ladder.info.get("sac"), json.loads(json.dumps(dataclasses.asdict(recipe.sac)))
+    changed = [key for key, value in wanted.items() if isinstance(used, dict) and used.get(key, value) != value]
     if changed:
         print(
             f"offbench: warning: that agent was trained with other [sac] settings than the recipe's "
-            f"({', '.join(changed)}); delete {ladder.folder.parent} to train it anew",
+            f"({', '.join(changed)}); delete {ladder.folder.parent} to train it again",
             file=sys.stderr,
         )
 

@@ -19,6 +19,7 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--id", dest="dataset_id", help="the dataset's id (default: <env>-<level>-v0)")
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset of that id")
     parser.add_argument("--retrain", action="store_true", help="use an agent trained here, not the shipped one")
+    parser.add_argument("--accept", action="store_true", help="take the nearest policy, however far from the level")
     _behaviour_dir(parser)
 
     def run(**arguments: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import sys
@@ -12,12 +13,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from offbench.agents.ladder import BEHAVIOUR, MEDIUM, MEDIUM_AT_MOST, Ladder, Rung, find_ladder
+from offbench.agents.build_ladder import random_reference
+from offbench.agents.ladder import BEHAVIOUR, MEDIUM, MEDIUM_AT_MOST, MEDIUM_LIMITS, NEAR, Ladder, Rung, find_ladder
 from offbench.agents.medium_replay import load_replay
 from offbench.common.errors import OffbenchError
 from offbench.common.files import sha256
 from offbench.common.processes import default_workers
-from offbench.common.progress import Progress, duration
+from offbench.common.progress import Progress
 from offbench.common.provenance import versions
 from offbench.data import minari_store
 from offbench.data.card import compare
@@ -47,6 +49,7 @@ def collect(
     dataset_id: str | None = None,
     overwrite: bool = False,
     retrain: bool = False,
+    accept: bool = False,
     behaviour_dir: str | Path = BEHAVIOUR,
 ) -> str:
     """Record one level of one environment as a local Minari dataset.
@@ -62,13 +65,14 @@ def collect(
         overwrite: replace a dataset of that id. Without it, the same dataset recorded again is left as it is, and
             another one is an error.
         retrain: use a behaviour agent trained here instead of the shipped one.
+        accept: record the nearest policy where none is near a fraction, or medium is far from a third of the expert.
         behaviour_dir: where agents trained here live.
 
     Returns:
         The dataset's id, for `minari.load_dataset` or `offbench.load`.
 
     Raises:
-        OffbenchError: anything that the user can mend, said in one line.
+        OffbenchError: anything that the user can fix, in one line.
     """
     recipe = load_recipe(env)
     name, parts = parse_mix(mix) if mix is not None else parse_level(level)
@@ -77,20 +81,24 @@ def collect(
         raise OffbenchError(f"steps must be at least 1, not {steps}")
     workers = default_workers(workers)
 
-    def prepared(ladder: Ladder) -> tuple[_Recording, list[Rung | None], list[int], dict[str, Any]]:
+    def prepare(ladder: Ladder | None) -> tuple[_Recording, list[Rung | None], list[int], dict[str, Any]]:
         recording = _Recording(recipe, ladder, seed, workers)
-        sources = [recording.source(part) for part in parts]
+        sources = [recording.source(part, accept) for part in parts]
         counts = _counts(recipe, ladder, parts, steps)
         return recording, sources, counts, _metadata(recording, dataset_id, mix or level, parts, sources, counts)
 
     ladder = find_ladder(recipe, Path(behaviour_dir), retrain)
-    if ladder and not overwrite and minari_store.exists(dataset_id) and _is(dataset_id, prepared(ladder)[-1]):
+    trained = ladder is not None or all(part.source == "uniform" for part in parts)  # uniform actions need no agent
+    prepared = prepare(ladder) if trained else None
+    if prepared and not overwrite and minari_store.exists(dataset_id) and _is(dataset_id, prepared[-1]):
         minari_store.tidy(dataset_id)
         print(f"offbench: {dataset_id} is recorded already, from the same policies and seed", file=sys.stderr)
         return dataset_id
     with minari_store.claimed(dataset_id, overwrite) as path:
-        ladder = ladder or _train(recipe, Path(behaviour_dir), workers)
-        recording, sources, counts, metadata = prepared(ladder)
+        if prepared is None:
+            ladder = _train(recipe, Path(behaviour_dir), workers)
+            prepared = prepare(ladder)
+        recording, sources, counts, metadata = prepared
         total = sum(counts)
         with Progress(total, f"recording {dataset_id}") as progress:
             streams = (recording.episodes(*item) for item in zip(parts, sources, counts, itertools.count()))
@@ -98,38 +106,34 @@ def collect(
             content = minari_store.write(path, episodes, recording.spec, metadata, total, recording.spaces)
     if seed == 0 and steps is None and not retrain and (said := compare(recipe, name, content)):
         print(f"offbench: {said}", file=sys.stderr)
-    warn_other_references(recipe, ladder)
+    if ladder:
+        warn_other_references(recipe, ladder)
     return dataset_id
 
 
 def _is(dataset_id: str, wanted: Mapping[str, Any]) -> bool:
     """Return whether a dataset was recorded from what `wanted`, its metadata to be, says, on this physics."""
-    known, ours = (minari_store.provenance(found) for found in (minari_store.read_metadata(dataset_id), dict(wanted)))
-    ours = json.loads(json.dumps(ours))  # as it was written: tuples are lists
-    made = [{name: part.get("versions", {}).get(name) for name in PHYSICS} for part in (known, ours)]
-    return all(known.get(key) == ours[key] for key in WHAT_IT_IS) and made[0] == made[1]
+    recorded = minari_store.provenance(minari_store.read_metadata(dataset_id))
+    ours = json.loads(json.dumps(minari_store.provenance(dict(wanted))))  # as it was written: tuples are lists
+    made = [{name: part.get("versions", {}).get(name) for name in PHYSICS} for part in (recorded, ours)]
+    return all(recorded.get(key) == ours[key] for key in WHAT_IT_IS) and made[0] == made[1]
 
 
 def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:
     """Train the recipe's behaviour agent now."""
     from offbench.agents.behaviour import behaviour
 
-    recipe.env_spec()  # refuses a bad environment before an hour is announced
-    gradient, steps = recipe.sac.steps * recipe.sac.gradient_steps, recipe.sac.steps
+    recipe.env_spec()  # refuses a bad environment before the training is announced
     print(
-        f"offbench: {recipe.name} has no behaviour agent in {behaviour_dir} yet; training SAC for {steps:,} steps "
-        f"first, roughly {duration(gradient / 65 + steps / 4000)} on one core (it resumes if stopped)",
-        file=sys.stderr,
+        f"offbench: {recipe.name} has no behaviour agent in {behaviour_dir} yet; training one first", file=sys.stderr
     )
     return behaviour(recipe, behaviour_dir=behaviour_dir, workers=workers)
 
 
-def _counts(recipe: Recipe, ladder: Ladder, parts: tuple[Part, ...], steps: int | None) -> list[int]:
+def _counts(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...], steps: int | None) -> list[int]:
     """Return the transitions of each part; medium-replay alone is as long as training made it."""
-    available = int(ladder.info["medium_replay"]["transitions"])
-    if steps is None and len(parts) == 1 and parts[0].source == "replay":
-        return [available]
-    total = steps if steps is not None else full_size(parts, recipe.dataset_steps)
+    available = int(ladder.info["medium_replay"]["transitions"]) if ladder else 0
+    total = steps if steps is not None else _full_size(recipe, ladder, parts)
     counts = shares(parts, total)
     if 0 in counts:
         raise OffbenchError(f"{total} steps leave a part of the blend without a transition; use more --steps")
@@ -141,11 +145,18 @@ def _counts(recipe: Recipe, ladder: Ladder, parts: tuple[Part, ...], steps: int 
     return counts
 
 
-class _Recording:
-    """What all parts of one dataset share."""
+def _full_size(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...]) -> int:
+    """Return the transitions of a dataset at its full size."""
+    if ladder and len(parts) == 1 and parts[0].source == "replay":
+        return int(ladder.info["medium_replay"]["transitions"])
+    return full_size(parts, recipe.dataset_steps)
 
-    def __init__(self, recipe: Recipe, ladder: Ladder, seed: int, workers: int) -> None:
-        self.recipe, self.ladder, self.seed, self.workers = recipe, ladder, seed, workers
+
+class _Recording:
+    """What all parts of one dataset share. Without a ladder, parts are of uniform actions only."""
+
+    def __init__(self, recipe: Recipe, ladder: Ladder | None, seed: int, workers: int) -> None:
+        self.recipe, self._ladder, self.seed, self.workers = recipe, ladder, seed, workers
         self.spec = recipe.env_spec()
         env = make_env(self.spec)
         self.observation_space: Any = env.observation_space
@@ -158,28 +169,68 @@ class _Recording:
         """Of observations and actions."""
         return self.observation_space, self.action_space
 
-    def source(self, part: Part) -> Rung | None:
-        """Return the rung a part is played by, or None for uniform actions and the replay."""
-        if part.source in ("uniform", "replay"):
+    @property
+    def ladder(self) -> Ladder:
+        """Of the behaviour agent."""
+        assert self._ladder is not None
+        return self._ladder
+
+    @functools.cached_property
+    def references(self) -> dict[str, Any]:
+        """The random and the expert reference; without a ladder the random one, measured here as a ladder's is."""
+        if self._ladder:
+            return dict(self._ladder.info["references"])
+        with Rollouts(self.spec, self.workers if self.workers > 1 else 0) as rollouts:
+            return {"random": random_reference(self.recipe, 0, rollouts)}
+
+    def full_size(self, parts: tuple[Part, ...]) -> int:
+        """Return the transitions of a dataset of these parts at its full size."""
+        return _full_size(self.recipe, self._ladder, parts)
+
+    def source(self, part: Part, accept: bool) -> Rung | None:
+        """Return the rung a part is played by, or None for uniform actions and the replay.
+
+        Raises:
+            OffbenchError: no rung is near what the part is defined as, and the user did not accept another.
+        """
+        if part.source == "uniform":
             return None
-        if part.source in ("medium", "expert"):
-            rung = self.ladder.role(part.source)
-            fraction = self.ladder.fraction(rung)
-            if part.source == "medium" and not MEDIUM <= fraction <= MEDIUM_AT_MOST:
-                remedy = "" if self.recipe.folder else "; a shorter [sac] segment in the recipe gives more rungs"
-                print(
-                    f"offbench: medium of {self.recipe.name} lies at {fraction:.2f} of the expert's return: "
-                    f"no rung of the training lies from {MEDIUM:.2f} to {MEDIUM_AT_MOST}{remedy}",
-                    file=sys.stderr,
-                )
-            return rung
-        rung = self.ladder.nearest(float(part.source))
+        if part.source not in ("medium", "replay", "expert"):
+            return self._nearest(float(part.source), accept)
+        rung = self.ladder.role("expert" if part.source == "expert" else "medium")
+        if part.source != "expert":
+            self._check_medium(rung, accept)
+        return None if part.source == "replay" else rung
+
+    def _nearest(self, fraction: float, accept: bool) -> Rung:
+        rung = self.ladder.nearest(fraction)
+        where = self.ladder.fraction(rung)
+        if abs(where - fraction) > NEAR and not accept:
+            near = " and ".join(f"{self.ladder.fraction(r):.2f}" for r in self.ladder.neighbors(fraction))
+            raise OffbenchError(
+                f"{self.recipe.name} has no policy within {NEAR} of {fraction:g} of the expert's return; the nearest: "
+                f"{near}; use such a fraction, or `offbench collect --accept` to record the nearest"
+            )
         print(
-            f"offbench: the rung nearest {part.source} is the one of step {rung.step:,}: return {rung.ret:.0f}, "
-            f"{self.ladder.fraction(rung):.2f} of the expert's",
+            f"offbench: the policy nearest {fraction:g} is the one of step {rung.step:,}: return {rung.ret:.0f}, "
+            f"{where:.2f} of the expert's",
             file=sys.stderr,
         )
         return rung
+
+    def _check_medium(self, rung: Rung, accept: bool) -> None:
+        fraction = self.ladder.fraction(rung)
+        if MEDIUM <= fraction <= MEDIUM_AT_MOST:
+            return
+        low, high = MEDIUM_LIMITS
+        said = f"medium of {self.recipe.name} is at {fraction:.2f} of the expert's return"
+        if not low <= fraction <= high and not accept:
+            raise OffbenchError(f"{said}, far from {MEDIUM:.2f}; `offbench collect --accept` records it all the same")
+        remedy = "" if self.recipe.folder else "; a shorter [sac] segment in the recipe keeps more policies"
+        print(
+            f"offbench: {said}: no policy of the training is at {MEDIUM:.2f} to {MEDIUM_AT_MOST}{remedy}",
+            file=sys.stderr,
+        )
 
     def policy(self, rung: Rung | None) -> Policy:
         """Return the policy that plays a part."""
@@ -205,16 +256,26 @@ class _Recording:
             finally:
                 endless.close()  # type: ignore[attr-defined]
 
+    def words(self, part: Part, rung: Rung | None) -> str:
+        """Return what a part is recorded from, for the dataset's description."""
+        if part.source == "uniform":
+            return "uniform-random actions"
+        if rung is None:
+            fraction = self.ladder.fraction(self.ladder.role("medium"))
+            return f"the replay of SAC's training up to its medium policy, at {fraction:.2f} of the expert's return"
+        fraction = self.ladder.fraction(rung)
+        return f"SAC's policy of training step {rung.step}, at {fraction:.2f} of the expert's return"
+
     def describe(self, part: Part, rung: Rung | None, count: int) -> dict[str, Any]:
         """Return a part's definition as measured, for the metadata."""
-        known: dict[str, Any] = {"source": part.source, "transitions": count}
+        described: dict[str, Any] = {"source": part.source, "transitions": count}
         if part.source == "replay":
             medium = self.ladder.info["levels"]["medium"]
-            return known | {"training_steps": medium, "sha256": self.ladder.info["medium_replay"]["sha256"]}
+            return described | {"training_steps": medium, "sha256": self.ladder.info["medium_replay"]["sha256"]}
         if rung is None:
-            random = self.ladder.info["references"]["random"]
-            return known | {"return": random["return"], "interval": [random["low"], random["high"]]}
-        return known | {
+            random = self.references["random"]
+            return described | {"return": random["return"], "interval": [random["low"], random["high"]]}
+        return described | {
             "rung": rung.step,
             "return": rung.ret,
             "interval": [rung.low, rung.high],
@@ -252,17 +313,11 @@ def _metadata(
     counts: list[int],
 ) -> dict[str, Any]:
     """Return Minari's metadata, all of it, and ours under one key."""
-    recipe, ladder, made = recording.recipe, recording.ladder, versions()
+    recipe, references, made = recording.recipe, recording.references, versions()
     described = [recording.describe(*item) for item in zip(parts, sources, counts, strict=True)]
-    references = ladder.info["references"]
-    uses = {
-        "uniform": "uniform-random actions",
-        "replay": "the replay of SAC's training up to its medium policy",
-    }
-    words = [
-        uses.get(p.source, f"SAC's policy of training step {r.step if r else 0}")
-        for p, r in zip(parts, sources, strict=True)
-    ]
+    full, total = recording.full_size(parts), sum(counts)
+    short = f" A short recording: {total:,} of {full:,} transitions." if total < full else ""
+    words = [recording.words(part, rung) for part, rung in zip(parts, sources, strict=True)]
     return {
         "dataset_id": dataset_id,
         "minari_version": made["minari"],
@@ -271,11 +326,11 @@ def _metadata(
         "author": {"offbench"},
         "author_email": {"offbench@example.org"},
         "code_permalink": f"{HOME}/tree/v{made['offbench']}",
-        "description": f"{recipe.env_id}, level {level}: {', then '.join(words)}. Recorded by offbench.",
+        "description": f"{recipe.env_id}, level {level}: {', then '.join(words)}. Recorded by offbench.{short}",
         "requirements": [f"mujoco=={made['mujoco']}", f"gymnasium=={made['gymnasium']}"],
         "ref_min_score": references["random"]["return"],
-        "ref_max_score": references["expert"]["return"],
-        "num_episodes_average_score": int(references["expert"]["episodes"]),
+        **({"ref_max_score": references["expert"]["return"]} if "expert" in references else {}),
+        "num_episodes_average_score": int(references["random"]["episodes"]),
         minari_store.KEY: {
             "format": "offbench-dataset-1",
             "env": recipe.name,
@@ -283,6 +338,7 @@ def _metadata(
             "seed": recording.seed,
             "recipe_sha256": recipe.sha256(),
             "parts": described,
+            "full_size": full,
             "references": references,
             "d4rl": None if recipe.d4rl_min is None else [recipe.d4rl_min, recipe.d4rl_max],
             MARGIN: recipe.contact_margin if recording.mujoco else None,

@@ -32,7 +32,12 @@ def inventory() -> dict[str, Any]:
         except (OffbenchError, KeyError, TypeError, ValueError):
             print(f"offbench: warning: {dataset_id} has damaged metadata", file=sys.stderr)
             continue
-        datasets[dataset_id] = counts | {"algorithm_name": metadata.get("algorithm_name")}
+        full = minari_store.provenance(metadata).get("full_size")
+        short = isinstance(full, int) and counts["total_steps"] < full
+        datasets[dataset_id] = counts | {
+            "algorithm_name": metadata.get("algorithm_name"),
+            "short_of": full if short else None,
+        }
     return {
         "environments": environments,
         "levels": list(LEVELS),
@@ -53,7 +58,8 @@ def inventory_lines() -> list[str]:
     lines += ["levels", f"  {', '.join(found['levels'])}, or a fraction such as 0.6"]
     lines += ["algorithms", f"  {', '.join(found['algorithms'])}", f"datasets in {minari_store.root()}"]
     for dataset_id, data in found["datasets"].items():
-        lines.append(f"  {dataset_id:<32}{data['total_steps']:>10,} steps{data['total_episodes']:>8,} episodes")
+        short = f"   short of {data['short_of']:,} steps" if data["short_of"] else ""
+        lines.append(f"  {dataset_id:<32}{data['total_steps']:>10,} steps{data['total_episodes']:>8,} episodes{short}")
     if not found["datasets"]:
         lines.append("  none; record one with `offbench collect ENV --level LEVEL`")
     return lines

@@ -29,7 +29,7 @@ def recorded(request: pytest.FixtureRequest, tiny: tuple[str, str]) -> Any:
     """Every level of the tiny recipe, as Minari loads it."""
     recipe, behaviour_dir = tiny
     blend = {"mix": "random:0.25,expert:0.75"} if request.param == "mix" else {"level": request.param}
-    return minari.load_dataset(offbench.collect(recipe, behaviour_dir=behaviour_dir, workers=1, **blend))
+    return minari.load_dataset(offbench.collect(recipe, behaviour_dir=behaviour_dir, workers=1, accept=True, **blend))
 
 
 def test_every_level_is_whole(recorded: Any) -> None:

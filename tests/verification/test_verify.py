@@ -74,7 +74,7 @@ def hopper() -> str:
 @pytest.mark.parametrize("level", [*LEVELS, "0.6", "mix"])
 def test_every_level_passes(level: str, tiny: tuple[str, str]) -> None:
     blend = {"mix": "random:0.25,expert:0.75"} if level == "mix" else {"level": level}
-    name = offbench.collect(tiny[0], behaviour_dir=tiny[1], workers=1, **blend)
+    name = offbench.collect(tiny[0], behaviour_dir=tiny[1], workers=1, accept=True, **blend)
     report = verify(name, workers=1)
     assert not report.findings, report.lines()
     assert not report.skipped
