@@ -109,7 +109,7 @@ def read_ladder(folder: Path) -> Ladder | None:
     if not (folder / "ladder.json").exists():
         return None
     info = read_json(folder / "ladder.json")
-    with damage(f"the ladder in {folder} is damaged", "delete it and build it again with `offbench behaviour`"):
+    with damage(f"the ladder in {folder}", "is damaged", "delete it and build it again with `offbench behaviour`"):
         with open(folder / "ladder.csv", newline="", encoding="utf-8", opener=regular) as file:
             rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
         ladder = Ladder(folder, info, rungs)

@@ -86,7 +86,7 @@ def load_grid(name: str) -> Grid:
         raise unknown("grid", name, shipped_grids())
     where = f"{path.name}"
     try:
-        with damage(f"{where}: not a readable TOML file", "correct it, or name another"):
+        with damage(where, "is not a readable TOML file", "correct it, or name another"):
             values = tomllib.loads(read_text(path))
     except FileNotFoundError:
         raise OffbenchError(f"no grid file {path}; shipped are {', '.join(shipped_grids())}") from None

@@ -14,7 +14,8 @@ from safetensors import safe_open
 from safetensors.torch import save
 
 from offbench.common.arrays import content_sha256
-from offbench.common.files import regular, write_bytes
+from offbench.common.errors import DamagedError
+from offbench.common.files import damage, regular, write_bytes
 
 KEPT = 2
 _NAME = re.compile(r"checkpoint-(\d{9,})\.safetensors")
@@ -38,21 +39,26 @@ def steps(folder: Path) -> list[int]:
 
 
 def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], State] | None:
-    """Read one checkpoint; None (and a line on stderr) if it is damaged."""
+    """Read one checkpoint; None (and a line on stderr) if it is damaged.
+
+    Raises:
+        OffbenchError: it cannot be read for another reason, so that a run does not resume from an older one.
+    """
     path = folder / f"checkpoint-{step:09d}.safetensors"
     try:
-        os.close(regular(path))  # safe_open would wait for a FIFO
-        with safe_open(path, framework="pt") as file:
-            state = json.loads((file.metadata() or {})["offbench"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        if not isinstance(state, dict) or state.get("step") != step:
-            raise ValueError(f"it is not of step {step}")
-        recorded = state.pop("sha256", None)  # older files have none
-        if recorded is not None and recorded != _sha256(tensors, state):
-            raise ValueError("its content is not what was written (SHA-256)")
-        return tensors, state
-    except Exception as error:  # damaged bytes bring out any error of any parser
-        print(f"offbench: {path} is damaged ({error}); using the one before it", file=sys.stderr)
+        with damage(str(path), "is damaged", "using the one before it"):
+            os.close(regular(path))  # safe_open would wait for a FIFO
+            with safe_open(path, framework="pt") as file:
+                state = json.loads((file.metadata() or {})["offbench"])
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            if not isinstance(state, dict) or state.get("step") != step:
+                raise ValueError(f"it is not of step {step}")
+            recorded = state.pop("sha256", None)  # older files have none
+            if recorded is not None and recorded != _sha256(tensors, state):
+                raise ValueError("its content is not what was written (SHA-256)")
+            return tensors, state
+    except (DamagedError, FileNotFoundError) as error:
+        print(f"offbench: {error}", file=sys.stderr)
         return None
 
 

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import difflib
+import os
+import re
 from collections.abc import Iterable
 
 NEAR = 0.76  # of two names' likeness: more than iql and cql, less than hoper and hopper
+DRAWING = ("MUJOCO_GL", "PYOPENGL_PLATFORM")  # environment variables that MuJoCo and PyOpenGL read when they load
 SHOW_TRACEBACK = "OFFBENCH_TRACEBACK=1 shows the traceback"
 
 
 class OffbenchError(Exception):
     """A problem the user can mend. The CLI prints its text as one line and exits with code 2."""
+
+
+class DamagedError(OffbenchError):
+    """The content of a file is at fault, rather than the disk, a lock or a permission."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
@@ -27,3 +34,14 @@ def unknown(what: str, name: str, known: Iterable[str]) -> OffbenchError:
     near = nearest(name, names)
     hint = f"did you mean {near!r}?" if near else f"known: {', '.join(names) or 'none'}"
     return OffbenchError(f"unknown {what} {name!r}: {hint}")
+
+
+def drawing_variable(error: BaseException) -> str | None:
+    """Return the environment variable, as NAME=VALUE, that kept MuJoCo or PyOpenGL from loading; None if none did."""
+    given = [f"{name}={os.environ[name]}" for name in DRAWING if os.environ.get(name)]
+    trace, modules = error.__traceback__, set()
+    while trace is not None:
+        modules.add(str(trace.tb_frame.f_globals.get("__name__", "")))
+        trace = trace.tb_next
+    at_fault = any(re.match(r"OpenGL\b|mujoco\..*(gl_context|egl|osmesa|glfw)", name) for name in modules)
+    return " and ".join(given) if given and at_fault else None

@@ -9,6 +9,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import socket
 import stat
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,10 +18,22 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import DamagedError, OffbenchError
 
 # errno to remedy
 OPEN_FILES: dict[int | None, str] = dict.fromkeys((errno.EMFILE, errno.ENFILE), "raise the limit with `ulimit -n`")
+LOCKED = (
+    "another program has it open for writing: wait until it is closed (if this disk has no file locks, set "
+    "HDF5_USE_FILE_LOCKING=FALSE)"
+)
+DISK = "check the disk or the network that holds it, and run the command again"
+READ_REMEDIES: dict[int | None, str] = {  # of errors that say nothing against a file's content
+    **OPEN_FILES,
+    **dict.fromkeys((errno.EAGAIN, errno.EWOULDBLOCK, errno.EDEADLK, errno.ENOLCK), LOCKED),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "check its permissions"),
+    **dict.fromkeys((errno.EIO, errno.ENXIO, errno.ENODEV, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN), DISK),
+    errno.ENOMEM: "close other programs",
+}
 ORPHANS = 3.0  # seconds to wait for a lock: processes whose parent was killed notice it within one
 
 
@@ -144,7 +157,7 @@ def write_json(path: Path, value: Any) -> None:
 def read_json(path: Path) -> Any:
     """Read a JSON file. Raises OffbenchError if it is missing or damaged."""
     try:
-        with damage(f"{path} is damaged or not JSON", "delete it to start over"):
+        with damage(str(path), "is damaged or not JSON", "delete it to start over"):
             found = json.loads(read_text(path))
             json.dumps(found, ensure_ascii=False).encode()  # "\\ud800" is JSON, but no text to be shown or written
             return found
@@ -162,19 +175,44 @@ def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
 
 
 @contextlib.contextmanager
-def damage(what: str, remedy: str) -> Iterator[None]:
-    """Turn whatever a reader of a file from elsewhere raises into one line; a missing file is left to the caller.
+def damage(name: str, fault: str, remedy: str) -> Iterator[None]:
+    """Turn any exception of a reader of a file from elsewhere into one line.
+
+    The operating system's refusals (a lock, no permission, a failing disk) and missing packages are reported as such,
+    all else as damage. A missing file is left to the caller.
 
     Args:
-        what: the file, and what is wrong with it, e.g. "run/config.json is damaged".
-        remedy: what to do about it.
+        name: the file, e.g. "run/config.json".
+        fault: what is wrong with it if its content is, e.g. "is damaged".
+        remedy: what to do about that.
+
+    Raises:
+        DamagedError: the content is at fault.
+        OffbenchError: it cannot be read for another reason.
     """
     try:
         yield
     except (OffbenchError, FileNotFoundError):
         raise
-    except Exception as error:  # damaged bytes bring out any error of any parser
-        raise OffbenchError(f"{what} ({error or type(error).__name__}); {remedy}") from error
+    except Exception as error:  # damaged bytes cause any exception of any parser
+        if other := _read_remedy(error):
+            raise OffbenchError(f"cannot read {name}: {_reason(error)}; {other}") from error
+        raise DamagedError(f"{name} {fault} ({_reason(error)}); {remedy}") from error
+
+
+def _read_remedy(error: BaseException) -> str | None:
+    """Return what to do about a failed read that says nothing against the content, None for any other."""
+    if isinstance(error, ImportError):
+        return f"install the package {error.name}" if error.name else "install it"
+    number = getattr(error, "errno", None)
+    if number is None and isinstance(error, OSError | RuntimeError):  # libhdf5 puts it into the text alone
+        inside = re.search(r"\berrno = (\d+)", str(error))
+        number = int(inside[1]) if inside else None
+    return READ_REMEDIES.get(number)
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def regular(path: str | Path, flags: int = os.O_RDONLY) -> int:

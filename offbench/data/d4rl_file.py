@@ -17,7 +17,8 @@ from offbench.common.errors import OffbenchError
 from offbench.data import minari_store
 
 COLUMNS = ("observations", "actions", "rewards", "terminals")
-OPTIONAL = ("timeouts", "next_observations", "infos/seed")
+SEEDS = ("infos/seed", "infos/seeded")  # seeded: where some episodes have a seed of 2**63 or more, and some none
+OPTIONAL = ("timeouts", "next_observations", *SEEDS)
 MOST_COMPRESSED = 1000  # times smaller than its numbers: no honest file is
 
 
@@ -31,6 +32,11 @@ class Source:
 
     def __len__(self) -> int:
         return len(self.columns["rewards"])
+
+    @property
+    def shapes(self) -> tuple[int, int]:
+        """The dimensions of observations and actions."""
+        return self.columns["observations"].shape[1], self.columns["actions"].shape[1]
 
     def read(self, name: str, first: int, end: int) -> Array:
         """Return rows [first, end) of a column; rewards and flags flat."""

@@ -13,7 +13,7 @@ import json
 import os
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from offbench.common.files import disk_errors, output_file
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.progress import Progress
 from offbench.data import minari_store
-from offbench.data.minari_reader import episodes_of, open_minari
+from offbench.data.minari_reader import episodes_of, open_minari, reading
 from offbench.envs.environments import box
 
 FORMATS = {"d4rl": (".hdf5", ".h5"), "npz": (".npz",)}  # and how their files end
@@ -65,6 +65,8 @@ def export(dataset_id: str, out: str | Path, *, style: str | None = None, drop_t
     path, metadata, data = output_file(out), minari_store.read_metadata(dataset_id), open_minari(dataset_id)
     for name in ("observation_space", "action_space"):
         box(getattr(data, name), f"{dataset_id}: {name}")
+    if not data.total_steps:
+        raise OffbenchError(f"{dataset_id} has no transitions; record it again")
     with disk_errors(str(path)), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         aside = Path(folder) / path.name
         with Progress(int(data.total_steps), f"exporting {dataset_id}") as progress:
@@ -93,29 +95,38 @@ def _style(out: Path, style: str | None) -> str:
 
 def _columns(data: Any, dataset_id: str, progress: Progress) -> Iterator[Columns]:
     """Yield the columns of one episode after another, checked to fit together."""
-    try:
-        for e in episodes_of(data):
-            steps = len(e)
-            shapes = [array.shape[:1] for array in e.arrays]
-            if (
-                not steps
-                or shapes != [(steps + 1,)] + [(steps,)] * 4
-                or e.actions.ndim != 2
-                or e.observations.ndim != 2
-            ):
-                raise OffbenchError(f"{dataset_id}, episode {e.index}: its arrays do not fit; see `offbench verify`")
-            yield {
-                "observations": e.observations[:-1],
-                "actions": e.actions,
-                "rewards": e.rewards,
-                "terminals": e.terminations.astype(bool),
-                "timeouts": e.truncations.astype(bool),
-                "next_observations": e.observations[1:],
-                "infos/seed": np.full(steps, -1 if e.seed is None else e.seed, np.int64),
-            }
-            progress.to(progress.done + steps)
-    except (KeyError, ValueError, RuntimeError) as error:
-        raise OffbenchError(f"{dataset_id} is damaged: {error}; record or download it again") from None
+    seeds = _seed_columns(data, dataset_id)
+    for e in episodes_of(data):
+        steps = len(e)
+        shapes = [array.shape[:1] for array in e.arrays]
+        if not steps or shapes != [(steps + 1,)] + [(steps,)] * 4 or e.actions.ndim != 2 or e.observations.ndim != 2:
+            raise OffbenchError(f"{dataset_id}, episode {e.index}: its arrays do not fit; see `offbench verify`")
+        yield {
+            "observations": e.observations[:-1],
+            "actions": e.actions,
+            "rewards": e.rewards,
+            "terminals": e.terminations.astype(bool),
+            "timeouts": e.truncations.astype(bool),
+            "next_observations": e.observations[1:],
+            **seeds(e.seed, steps),
+        }
+        progress.to(progress.done + steps)
+
+
+def _seed_columns(data: Any, dataset_id: str) -> Callable[[int | None, int], Columns]:
+    """Return what makes an episode's columns of its seed.
+
+    Seeds are int64, and -1 where there is none; if one is 2**63 or more (Minari's DataCollector draws 64 bits) they
+    are uint64, with a column that says which episodes have one.
+    """
+    with reading(dataset_id):
+        largest = max(about.get("seed") or 0 for about in data.storage.get_episode_metadata(data.episode_indices))
+    if largest < 2**63:
+        return lambda seed, steps: {"infos/seed": np.full(steps, -1 if seed is None else seed, np.int64)}
+    return lambda seed, steps: {
+        "infos/seed": np.full(steps, seed or 0, np.uint64),
+        "infos/seeded": np.full(steps, seed is not None),
+    }
 
 
 def _about(data: Any, metadata: dict[str, Any]) -> str:

@@ -1,22 +1,23 @@
-"""`import-d4rl`: a D4RL file as a Minari dataset, with its first environment on record.
+"""`import-d4rl`: a D4RL file as a Minari dataset.
 
 D4RL files are flat: row i is a transition, episodes lie end to end.
 
-    v0   observations actions rewards terminals                     cut every 1000 steps (no timeouts)
+    v0   observations actions rewards terminals                     no timeouts: cut at the environment's time limit
     v1   ... timeouts infos/                                        a step at a timeout has no next observation
-    v2   ... timeouts next_observations infos/ metadata/            all there
+    v2   ... timeouts next_observations infos/ metadata/            complete
 
 Where a file has no next_observations, the step at a timeout is dropped (its observation becomes the episode's last
 one): bootstrapping over it would need an observation that the file lacks. D4RL's own loader does the same. After a
-termination nothing is bootstrapped, so there the last observation stands in for the missing one. Both are said in
+termination nothing is bootstrapped, so there the last observation stands in for the missing one. Both are noted in
 the metadata, under `offbench`. infos/ are left out.
 """
 
 from __future__ import annotations
 
 import json
-import re
+import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +28,21 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import sha256_of
+from offbench.common.files import damage, sha256_of
 from offbench.common.progress import Progress
 from offbench.common.provenance import versions
 from offbench.data import minari_store
-from offbench.data.d4rl_file import NUMBERS, Source, read_source
+from offbench.data.d4rl_file import NUMBERS, SEEDS, Source, read_source
 from offbench.envs.contact_margin import ADDED, MARGIN, without_margin
-from offbench.envs.environments import box, make_env
-from offbench.envs.recipes import Recipe, d4rl_constants, load_recipe, names
+from offbench.envs.environments import box, make_env, time_limit
+from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference, load_recipe, names
 from offbench.rollouts.rollouts import Episode
 
-LIMIT = 1000  # steps of an episode of D4RL's MuJoCo tasks
 BLOCK = 65_536  # rows read at once
-ORIGINAL = {"Hopper": "Hopper-v2", "HalfCheetah": "HalfCheetah-v2", "Walker2d": "Walker2d-v2", "Ant": "Ant-v2"}
+RESETS = 64  # of the environment, to learn where episodes begin
+WITHIN, BEYOND = 2.0, 6.0  # multiples of the spread of first observations: what is one, and what is none
+# observations and actions of the environments that D4RL's own files were recorded in
+ORIGINAL = {"Hopper-v2": (11, 3), "HalfCheetah-v2": (17, 6), "Walker2d-v2": (17, 6), "Ant-v2": (111, 8)}
 LEVEL_WORDS = ("random", "medium", "expert", "mixed", "full")
 
 
@@ -49,91 +52,222 @@ def import_d4rl(file: str | Path, dataset_id: str, *, env: str | None = None, ov
     Args:
         file: the HDF5 file.
         dataset_id: the Minari id.
-        env: the recipe to evaluate in; guessed from names such as `hopper_medium-v2.hdf5`.
+        env: the recipe of the environment that the file was recorded in, and that policies are evaluated in. By
+            default it follows from a name such as `hopper_medium-v2.hdf5`, as D4RL's own files have it: recorded in
+            Hopper-v2, evaluated in the shipped recipe. A file of `offbench export` says itself.
         overwrite: replace a dataset of that id.
 
     Returns:
         The id.
 
     Raises:
-        OffbenchError: not such a file, damaged, NaN, an environment that does not fit or cannot be guessed.
+        OffbenchError: not such a file, damaged, NaN, without a whole transition, or without timeouts where no time
+            limit is known; an environment that does not fit or cannot be guessed.
     """
     path = Path(file)
     minari_store.check_id(dataset_id)
     if not path.is_file():
         raise OffbenchError(f"no file {path}")
     try:
-        with h5py.File(path, "r") as opened:
+        with (
+            damage(str(path), "is not a readable D4RL file", "download or export it again"),
+            h5py.File(path) as opened,
+        ):
             source = read_source(path, opened)
-            recipe = _recipe(path, env, source)
-            ends = _ends(source, LIMIT)
-            metadata, spec, spaces = _metadata(source, recipe, env is not None, dataset_id)
+            origin = _origin(source, env)
+            ends = _ends(source, origin)
+            metadata, spaces = _metadata(source, origin, dataset_id)
             with (
-                minari_store.claimed(dataset_id, overwrite) as place,
+                minari_store.claimed(dataset_id, overwrite) as folder,
                 Progress(len(source), f"importing {path}") as bar,
             ):
                 known = metadata[minari_store.KEY].get("content_sha256")
-                minari_store.write(place, _episodes(source, ends, bar), spec, metadata, len(source), spaces, known)
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # h5py raises all of these for damage
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        raise OffbenchError(f"{path} is not a readable D4RL file: {reason}") from None
+                episodes = _episodes(source, ends, bar)
+                minari_store.write(folder, episodes, origin.recorded, metadata, len(source), spaces, known)
+    except FileNotFoundError as error:
+        raise OffbenchError(f"{error.filename or path} is gone; run the command again") from None
     return dataset_id
 
 
-def _recipe(path: Path, env: str | None, source: Source) -> Recipe | None:
-    """Return the recipe of a file's environment: what the user says, else by its name; None if the file knows."""
+@dataclass(frozen=True)
+class _Origin:
+    """The environment of a file.
+
+    Attributes:
+        recorded: the EnvSpec (JSON) of the environment it was recorded in, None if nobody says.
+        evaluated: that of the environment to evaluate policies in.
+        recipe: whose action bounds hold where the file has none.
+    """
+
+    recorded: str | None
+    evaluated: str | None
+    recipe: Recipe | None = None
+
+    @property
+    def limit(self) -> int | None:
+        """The time limit of the environment it was recorded in."""
+        return time_limit(EnvSpec.from_json(without_margin(self.recorded)[0])) if self.recorded else None
+
+
+def _origin(source: Source, env: str | None) -> _Origin:
+    """Return a file's environment: what an export's metadata say, then what the user says, then by the file's name.
+
+    Raises:
+        OffbenchError: it cannot be told, or has other shapes than the file.
+    """
+    about, path = source.about, source.path
+    exported = len(about.get("spaces", ())) == 2
     if env is not None:
-        return load_recipe(env)
-    if "env_spec" in source.about:
-        return None
+        recipe = load_recipe(env)
+        spec = recipe.env_spec()
+        if (shapes := _shapes(spec)) != source.shapes:
+            raise OffbenchError(
+                f"{path} has {_words(source.shapes)}, {recipe.env_id} has {_words(shapes)}: give the right --env"
+            )
+        return _Origin(about.get("env_spec") or spec, spec, recipe)
+    if exported or "env_spec" in about:
+        return _Origin(about.get("env_spec"), about.get("eval_env_spec"))
     word, _, rest = path.stem.lower().replace("-", "_").partition("_")
     found = [name for name in names() if word and name.replace("-", "_").startswith(word)]
     if len(found) != 1 or not rest.startswith(LEVEL_WORDS):
         raise OffbenchError(f"cannot tell the environment of {path.name}; give it, e.g. --env hopper")
-    return load_recipe(found[0])
+    return _by_name(source, load_recipe(found[0]))
 
 
-def _ends(source: Source, limit: int) -> dict[int, tuple[bool, bool]]:
+def _by_name(source: Source, recipe: Recipe) -> _Origin:
+    """Return the environment of a file that is named like D4RL's own ones."""
+    spec, family = recipe.env_spec(), recipe.env_id.rpartition("-v")[0]
+    name = next((name for name in ORIGINAL if name.startswith(f"{family}-v")), None)
+    if name is None:
+        recorded, shapes = spec, _shapes(spec)
+    else:
+        code = f"gym.envs.mujoco:{family}Env"
+        recorded, shapes = EnvSpec(name, code, max_episode_steps=D4RL_LIMIT).to_json(), ORIGINAL[name]
+    if shapes != source.shapes:
+        raise OffbenchError(
+            f"{source.path.name} is named like a file of {name or recipe.env_id}, which has {_words(shapes)}, but has "
+            f"{_words(source.shapes)}; give its environment, e.g. --env my-env.toml"
+        )
+    if _shapes(spec) == source.shapes:
+        return _Origin(recorded, spec, recipe)
+    print(
+        f"offbench: warning: {source.path.name} is of {name}, which has {_words(shapes)}, and {recipe.env_id} has "
+        f"{_words(_shapes(spec))}: policies are not evaluated",
+        file=sys.stderr,
+    )
+    return _Origin(recorded, None, recipe)
+
+
+def _shapes(spec: str) -> tuple[int, int]:
+    """Return the dimensions of observations and actions of an environment with flat spaces."""
+    env: Any = make_env(spec)
+    env.close()
+    return env.observation_space.shape[0], env.action_space.shape[0]
+
+
+def _words(shapes: tuple[int, int]) -> str:
+    return f"{shapes[0]} observations and {shapes[1]} actions"
+
+
+def _ends(source: Source, origin: _Origin) -> dict[int, tuple[bool, bool]]:
     """Return {last row of an episode: (terminated, truncated)} in order.
 
-    Without timeouts an episode is cut every `limit` rows; the step at the limit counts as a timeout even where it
-    terminates, as in D4RL. Where next_observations do not go on in the next row, an episode ends there whatever the
+    Without timeouts an episode is cut at the environment's time limit; the step at the limit counts as a timeout even
+    where it terminates, as in D4RL. Where the next row is not the next observation, an episode ends whatever the
     flags say: it is truncated.
     """
-    count = len(source)
+    count, complete = len(source), "next_observations" in source.columns
     terminals = source.read("terminals", 0, count).astype(bool)
-    stops = terminals | _broken(source)
-    stops[-1] = True
+    timeouts = np.zeros(count, bool)
     if "timeouts" in source.columns:
-        timeouts = source.read("timeouts", 0, count).astype(bool)
-    else:
-        timeouts, begin = np.zeros(count, bool), 0
-        for last in np.flatnonzero(stops).tolist():
-            timeouts[begin + limit - 1 : last + 1 : limit] = True
-            begin = last + 1
+        timeouts |= source.read("timeouts", 0, count).astype(bool)
+    stops = terminals | (_broken(source) if complete else timeouts)
+    if "timeouts" not in source.columns:
+        stops[-1] = True
+        limit, begin, resets = origin.limit, 0, 0
+        starts = _starts(source, origin) if not complete else np.zeros(count + 1, bool)
+        if limit is None and not complete:
+            raise OffbenchError(
+                f"{source.path} has no timeouts, and its environment no time limit to cut the episodes at; add the "
+                "column timeouts, or give an --env with a limit ([env_kwargs] max_episode_steps)"
+            )
+        if limit is not None:
+            for last in np.flatnonzero(stops | starts[1:]).tolist():
+                # an unflagged reset is the clock's: late in an episode, or at the end of one that the file cuts off
+                late = (last + 1 - begin) % limit >= limit // 2 or (begin == 0 and not starts[0])
+                if stops[last] or late:
+                    resets += not stops[last]
+                    stops[last] = True
+                    timeouts[begin + limit - 1 : last + 1 : limit] = True
+                    begin = last + 1
+        if resets:
+            print(
+                f"offbench: {source.path} has {resets:,} resets within what its flags call one episode; cut there",
+                file=sys.stderr,
+            )
+    stops[-1] = True
+    unflagged = int((stops & ~terminals & ~timeouts)[:-1].sum())
+    if complete and 2 * unflagged > count:
+        print(
+            f"offbench: warning: {source.path}: the next_observations of {unflagged:,} of {count:,} rows are not the "
+            "observations of the next row, so each is the end of an episode (rounded numbers, or shuffled rows?)",
+            file=sys.stderr,
+        )
     found = np.flatnonzero(stops | timeouts)
     return {int(i): (bool(terminals[i]), bool(timeouts[i] or not terminals[i])) for i in found}
 
 
 def _broken(source: Source) -> Array:
-    """Return which rows' next observation is not the observation of the row behind."""
+    """Return which rows' next observation is not the observation of the next row, in the lower of their precisions."""
     broken = np.zeros(len(source), bool)
-    if "next_observations" in source.columns:
-        for first in range(0, len(source) - 1, BLOCK):
-            following = source.read("observations", first + 1, min(len(source), first + 1 + BLOCK))
-            reached = source.read("next_observations", first, first + len(following))
-            broken[first : first + len(following)] = (following != reached).any(1)
+    types = [source.columns[name].dtype for name in ("observations", "next_observations")]
+    floats = all(np.issubdtype(kind, np.floating) for kind in types)
+    common = min(types, key=lambda kind: kind.itemsize) if floats else np.result_type(*types)
+    for first in range(0, len(source) - 1, BLOCK):
+        following = source.read("observations", first + 1, min(len(source), first + 1 + BLOCK))
+        reached = source.read("next_observations", first, first + len(following))
+        with np.errstate(over="ignore"):
+            broken[first : first + len(following)] = (following.astype(common) != reached.astype(common)).any(1)
     return broken
+
+
+def _starts(source: Source, origin: _Origin) -> Array:
+    """Return which rows [rows + 1] look like the first of an episode, the row before them being far from that.
+
+    D4RL's v0 files have no timeouts, begin in the middle of an episode, and where only the clock ends episodes they
+    have 999 rows of each: cut at the limit alone, each would hold a transition from one episode into the next. First
+    observations lie where the environment's resets lie.
+    """
+    found = np.zeros(len(source) + 1, bool)
+    if origin.evaluated is None:
+        print(
+            f"offbench: warning: {source.path} has no timeouts, and without its environment an episode that begins "
+            "before the time limit of the last one cannot be told: each is one false transition",
+            file=sys.stderr,
+        )
+        return found
+    env = make_env(origin.evaluated)
+    first_ones = np.array([env.reset(seed=seed)[0] for seed in range(RESETS)], np.float64)
+    env.close()
+    middle, spread = (first_ones.max(0) + first_ones.min(0)) / 2, (first_ones.max(0) - first_ones.min(0)) / 2
+    slack, was_away = 1e-6 * (1 + np.abs(middle)), np.array([True])
+    for first in range(0, len(source), BLOCK):
+        off = np.abs(source.read("observations", first, min(len(source), first + BLOCK)) - middle)
+        away = np.concatenate([was_away, (off > BEYOND * spread + slack).any(1)])
+        found[first : first + len(off)] = away[:-1] & (off <= WITHIN * spread + slack).all(1)
+        was_away = away[-1:]
+    return found
 
 
 def _episodes(source: Source, ends: dict[int, tuple[bool, bool]], progress: Progress) -> Iterator[Episode]:
     """Yield the episodes, many rows read at once."""
     complete, lasts, begin, i = "next_observations" in source.columns, list(ends), 0, 0
+    empty = True
     while i < len(lasts):
         group = [lasts[i]]
         while i + len(group) < len(lasts) and lasts[i + len(group)] - begin < BLOCK:
             group.append(lasts[i + len(group)])
-        wanted = ("observations", "actions", "rewards", "next_observations", "infos/seed")
+        wanted = ("observations", "actions", "rewards", "next_observations", *SEEDS)
         names_ = [name for name in wanted if name in source.columns]
         rows = {name: source.read(name, begin, group[-1] + 1) for name in names_}
         offset = begin
@@ -144,10 +278,15 @@ def _episodes(source: Source, ends: dict[int, tuple[bool, bool]], progress: Prog
                 raise OffbenchError(f"{source.path}: {where} hold NaN or infinite numbers; filter them out")
             episode = _episode(part, *ends[last], complete)
             if len(episode):
+                empty = False
                 yield episode
             begin = last + 1
         progress.to(begin)
         i += len(group)
+    if empty:
+        raise OffbenchError(
+            f"{source.path}: none of its {len(source):,} rows has a next observation; there is nothing to import"
+        )
 
 
 def _episode(part: dict[str, Array], terminated: bool, truncated: bool, complete: bool) -> Episode:
@@ -158,25 +297,24 @@ def _episode(part: dict[str, Array], terminated: bool, truncated: bool, complete
         observations = np.concatenate([observations, observations[-1:]])
     else:
         actions, rewards = actions[:-1], rewards[:-1]
-    seed = int(part["infos/seed"][0]) if "infos/seed" in part else -1
+    seeded = "infos/seed" in part and part.get("infos/seeded", [True])[0]
+    seed = int(part["infos/seed"][0]) if seeded else -1
     return Episode(seed, observations, actions, rewards, terminated, truncated)
 
 
 def _metadata(
-    source: Source, recipe: Recipe | None, demanded: bool, dataset_id: str
-) -> tuple[dict[str, Any], str, tuple[gym.Space[Any], gym.Space[Any]]]:
-    """Return Minari's metadata, the EnvSpec the data were recorded in, and the spaces."""
+    source: Source, origin: _Origin, dataset_id: str
+) -> tuple[dict[str, Any], tuple[gym.Space[Any], gym.Space[Any]]]:
+    """Return Minari's metadata and the spaces."""
     about, complete = source.about, "next_observations" in source.columns
-    spec = about.get("env_spec") or _original(recipe)
     known = {key: about[key] for key in (*NUMBERS, "requirements") if key in about}
     known |= {key: set(about[key]) for key in ("author", "author_email") if key in about}
-    evaluated = _evaluated(source, recipe, demanded) if recipe else about.get("eval_env_spec")
-    env_id = str(json.loads(spec)["id"])
+    constants = d4rl_reference(origin.recorded)
     ours: dict[str, Any] = {
         "format": "offbench-import-1",
         "timeouts": "kept" if complete else "dropped",
         "final_observations": "kept" if complete else "repeated",
-        "d4rl": d4rl_constants(env_id),
+        "d4rl": constants,
     }
     ours |= about.get(minari_store.KEY, {})
     ours["imported"] = {
@@ -184,46 +322,19 @@ def _metadata(
         "sha256": sha256_of(source.path),
         "offbench": versions()["offbench"],
     }
+    where = f", recorded in {json.loads(origin.recorded)['id']}" if origin.recorded else ""
     metadata: dict[str, Any] = known | {
         "dataset_id": dataset_id,
         "minari_version": versions()["minari"],
         "algorithm_name": about.get("algorithm_name", "unknown"),
-        "description": about.get("description", f"D4RL file {source.path.name}, recorded in {env_id}."),
+        "description": about.get("description", f"D4RL file {source.path.name}{where}."),
         minari_store.KEY: ours,
     }
-    if evaluated:
-        metadata["eval_env_spec"], rule = without_margin(evaluated)
-        if recipe and rule == ADDED:
+    if origin.evaluated:
+        metadata["eval_env_spec"], rule = without_margin(origin.evaluated)
+        if origin.recipe and rule == ADDED:
             ours[MARGIN] = rule
-    return metadata, spec, _spaces(source, recipe)
-
-
-def _original(recipe: Recipe | None) -> str:
-    """Return the EnvSpec of the environment a D4RL file was recorded in; today's Gymnasium cannot make it."""
-    assert recipe is not None  # without metadata of ours there is one
-    family = re.fullmatch(r"(.*)-v\d+", recipe.env_id)
-    name = ORIGINAL.get(family[1] if family else "")
-    if name is None:
-        return recipe.env_spec()
-    spec = EnvSpec(name, f"gym.envs.mujoco:{name.partition('-')[0]}Env", max_episode_steps=LIMIT)
-    return spec.to_json()
-
-
-def _evaluated(source: Source, recipe: Recipe, demanded: bool) -> str | None:
-    """Return the recipe's EnvSpec if it fits the file; a guessed one that does not is left out (Ant-v2 and -v5)."""
-    spec = recipe.env_spec()
-    env = make_env(spec)
-    shapes = (env.observation_space.shape, env.action_space.shape)
-    env.close()
-    theirs = tuple(source.columns[name].shape[1:] for name in ("observations", "actions"))
-    if shapes == theirs:
-        return spec
-    if demanded:
-        raise OffbenchError(
-            f"{source.path} has observations {theirs[0]} and actions {theirs[1]}, {recipe.env_id} has {shapes[0]} "
-            f"and {shapes[1]}: give the right --env"
-        )
-    return None
+    return metadata, _spaces(source, origin.recipe)
 
 
 def _spaces(source: Source, recipe: Recipe | None) -> tuple[gym.Space[Any], gym.Space[Any]]:

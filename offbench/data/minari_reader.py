@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -11,8 +12,21 @@ import h5py
 import numpy as np
 
 from offbench.common.arrays import Array
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import DamagedError
+from offbench.common.files import damage
 from offbench.data import minari_store
+
+AGAIN = "record or download it again"
+
+
+def reading(dataset_id: str) -> contextlib.AbstractContextManager[None]:
+    """Read a dataset within this context.
+
+    Raises:
+        DamagedError: its content is at fault.
+        OffbenchError: its files are locked, may not be read, or need a package that is not installed.
+    """
+    return damage(dataset_id, "is damaged", AGAIN)
 
 
 @dataclass(frozen=True)
@@ -39,15 +53,18 @@ class Recorded:
 def episodes_of(data: Any, indices: Iterable[int] | None = None) -> Iterator[Recorded]:
     """Yield a MinariDataset's episodes (all, or those of `indices`) with their seeds.
 
-    Whatever Minari raises about damaged files goes through.
+    Raises:
+        DamagedError, OffbenchError: as `reading` has it.
     """
     wanted = [int(i) for i in (data.episode_indices if indices is None else indices)]
-    known = data.storage.get_episode_metadata(wanted)
-    for episode, about in zip(data.iterate_episodes(wanted), known, strict=True):
-        # an episode that was reset with options cannot be reset from its seed alone
-        seed = None if about.get("options") else about.get("seed")
-        arrays = (episode.observations, episode.actions, episode.rewards, episode.terminations, episode.truncations)
-        yield Recorded(int(episode.id), None if seed is None else int(seed), *map(np.asarray, arrays))
+    with reading(data.spec.dataset_id):
+        known = data.storage.get_episode_metadata(wanted)
+        for episode, about in zip(data.iterate_episodes(wanted), known, strict=True):
+            # an episode that was reset with options cannot be reset from its seed alone
+            seed = None if about.get("options") else about.get("seed")
+            flags = episode.terminations, episode.truncations
+            arrays = map(np.asarray, (episode.observations, episode.actions, episode.rewards, *flags))
+            yield Recorded(int(episode.id), None if seed is None else int(seed), *arrays)
 
 
 def open_minari(dataset_id: str) -> Any:
@@ -63,13 +80,10 @@ def open_minari(dataset_id: str) -> Any:
 def check_storage(dataset_id: str) -> None:
     """Refuse HDF5 files whose arrays lie elsewhere: HDF5 would follow them to any file of this machine."""
     for path in sorted((minari_store.path_of(dataset_id) / "data").rglob("*.hdf5")):
-        try:
-            with h5py.File(path) as file:
-                elsewhere = _elsewhere(file)
-        except (OSError, KeyError, ValueError, RuntimeError) as error:
-            raise OffbenchError(f"{dataset_id} cannot be read: {error}; record or download it again") from error
+        with reading(dataset_id), h5py.File(path) as file:
+            elsewhere = _elsewhere(file)
         if elsewhere:
-            raise OffbenchError(f"{dataset_id} is not read: {elsewhere} is not data of {path}; get it from its source")
+            raise DamagedError(f"{dataset_id} is not read: {elsewhere} is not data of {path}; get it from its source")
 
 
 def _elsewhere(file: h5py.File) -> str | None:
@@ -94,19 +108,17 @@ def open_parsed(dataset_id: str) -> Any:
     metadata = minari_store.read_metadata(dataset_id)
     if "observation_space" not in metadata or "action_space" not in metadata:
         # Minari would make the environment to ask it, running whatever code the file names
-        raise OffbenchError(f"{dataset_id} cannot be read: its metadata lack a space; record or download it again")
+        raise DamagedError(f"{dataset_id} is damaged (its metadata lack a space); {AGAIN}")
     size = sum(
         path.stat().st_size for path in (minari_store.root() / dataset_id / "data").rglob("*") if path.is_file()
     )
     if not 0 <= (metadata.get("total_episodes") or 0) <= size:
-        raise OffbenchError(
-            f"{dataset_id} cannot be read: its files are too small for its episodes; download it again"
-        )
+        raise DamagedError(f"{dataset_id} is damaged (its files are too small for its episodes); {AGAIN}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import minari
 
-        try:
-            return minari.MinariDataset(minari_store.root() / dataset_id / "data")
-        except Exception as error:  # Minari, h5py and JSON each raise their own kinds for damaged files
-            raise OffbenchError(f"{dataset_id} cannot be read: {error}; record or download it again") from error
+        with reading(dataset_id):
+            data = minari.MinariDataset(minari_store.root() / dataset_id / "data")
+            int(data.total_steps)  # Minari reads it from the metadata when it is asked for
+            return data

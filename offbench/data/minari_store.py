@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
-from offbench.common.errors import OffbenchError, nearest, unknown
+from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
 from offbench.common.files import disk_errors, read_json, sole
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.data.levels import parse_level
@@ -126,7 +126,7 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
     try:
         _check_metadata(metadata)
     except (ValueError, TypeError, RecursionError) as error:
-        raise OffbenchError(f"{path} is damaged: {error}; record or download the dataset again") from None
+        raise DamagedError(f"{path} is damaged: {error}; record or download the dataset again") from None
     return dict(metadata)
 
 
@@ -247,7 +247,7 @@ def tidy(dataset_id: str) -> None:
 def write(
     path: Path,
     episodes: Iterable[Episode],
-    spec: str,
+    spec: str | None,
     metadata: dict[str, Any],
     steps: int,
     spaces: tuple[gym.Space[Any], gym.Space[Any]] | None = None,
@@ -257,13 +257,13 @@ def write(
 
     Args:
         path: the folder of a claimed id; what is there is replaced at the last moment.
-        spec: the environment's EnvSpec as JSON.
+        spec: the environment's EnvSpec as JSON, None if nobody knows it (`spaces` are needed then).
         metadata: Minari's fields; the content hash joins those under the key `offbench`.
         steps: transitions to come, to see beforehand whether the disk has room.
         spaces: of observations and actions, where the environment is not to be asked (it may be no longer there).
         expected: the content hash to come, where it is known; any other content is refused.
     """
-    env_spec = EnvSpec.from_json(without_margin(spec)[0])
+    env_spec = EnvSpec.from_json(without_margin(spec)[0]) if spec else None
     aside = _partial(path)
     with disk_errors(str(path)):
         (aside / "data").mkdir(parents=True)
@@ -275,6 +275,8 @@ def write(
             content, dtype = ContentHash(), storage.observation_space.dtype
             with safe_file(storage._file_path) as storage._file_path:  # so that a full disk is no crash
                 storage.update_episodes(_buffers(episodes, dtype, content, storage._file_path))
+            if not storage.total_steps:
+                raise OffbenchError("there are no transitions to write")
             if expected not in (None, content.hexdigest()):
                 raise OffbenchError(
                     "the data are not those that were exported (their hash differs); export them again"

@@ -31,12 +31,14 @@ from offbench.common.files import disk_errors, read_text, write_json
 from offbench.common.progress import Progress
 from offbench.data import minari_store
 from offbench.data.file_stamps import ReplacedError, Stamps, checked, recorded, unchanged
-from offbench.data.minari_reader import check_storage, open_parsed
+from offbench.data.minari_reader import check_storage, open_parsed, reading
 from offbench.data.recorded_env import evaluation_spec
-from offbench.envs.environments import box
+from offbench.envs.environments import action_box, box
 
 ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
 ATTEMPTS = 3  # to read a dataset that is replaced meanwhile
+NUMBERS = ("observations", "actions", "rewards")
+LARGEST = float(np.finfo(np.float32).max)
 CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding are worth a warning
 
 
@@ -118,9 +120,7 @@ def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     metadata = minari_store.read_metadata(dataset_id)
     data = open_parsed(dataset_id)
     observation_space = box(data.observation_space, f"{dataset_id}: observations")
-    action_space = box(data.action_space, f"{dataset_id}: actions")
-    if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
-        raise OffbenchError(f"{dataset_id}: the action space must be bounded to be scaled, not {action_space}")
+    action_space = action_box(data.action_space, f"{dataset_id}: actions")
     folder = cache() / _key(dataset_id, metadata, stamps)
     sources = {f"data/{name}": minari_store.path_of(dataset_id) / "data" / name for name in stamps}
     found = _mapped(folder, sources)
@@ -257,17 +257,15 @@ def _remove_leftovers(folder: Path) -> None:
 
 
 def _episodes(data: Any, dataset_id: str) -> Iterator[Any]:
-    try:
+    with reading(dataset_id):
         yield from data.iterate_episodes()
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
-        raise OffbenchError(f"{dataset_id} is damaged: {error}; record or download it again") from error
 
 
 def _episode_arrays(
     episode: Any, observations: gym.spaces.Box, actions: gym.spaces.Box, where: str
 ) -> dict[str, Array]:
     """Return one episode's arrays as float32, checked: shapes, T + 1 observations, finite numbers."""
-    steps = len(episode.rewards)
+    steps = len(episode.rewards) if np.ndim(episode.rewards) else 0
     shapes = {
         "observations": (steps + 1, *observations.shape),
         "actions": (steps, *actions.shape),
@@ -278,12 +276,21 @@ def _episode_arrays(
         found = np.shape(getattr(episode, name))
         if found != shape or not steps:
             raise OffbenchError(f"{where}: {name} have shape {found}, expected {shape}; the dataset is damaged")
-    flat = {name: np.asarray(getattr(episode, name), np.float32) for name in ("observations", "actions", "rewards")}
-    for name, array in flat.items():
-        if not np.isfinite(array).all():
-            raise OffbenchError(f"{where}: {name} hold NaN or infinite numbers; filter them out of the dataset")
+    flat = {name: _float32(np.asarray(getattr(episode, name)), f"{where}: {name}") for name in NUMBERS}
     flat["masks"] = 1.0 - np.asarray(episode.terminations, np.float32)
     return flat
+
+
+def _float32(array: Array, what: str) -> Array:
+    """Return finite numbers as float32. Raises OffbenchError if some are not finite, or too large for float32."""
+    if array.dtype.kind not in "fiub":
+        raise OffbenchError(f"{what} are {array.dtype}, not numbers; the dataset is damaged")
+    if not np.isfinite(array).all():
+        raise OffbenchError(f"{what} hold NaN or infinite numbers; filter them out of the dataset")
+    largest = float(np.abs(array).max(initial=0))
+    if largest > LARGEST:
+        raise OffbenchError(f"{what} reach {largest:.3g}, beyond float32's {LARGEST:.2g}; scale them in the dataset")
+    return np.asarray(array, np.float32)
 
 
 def _scaled(actions: Array, space: gym.spaces.Box, dataset_id: str) -> Array:

@@ -8,6 +8,7 @@ from offbench.common.errors import OffbenchError
 
 MARGIN = "contact_margin"
 EARLIER, ADDED = "max", "sum"  # the larger margin of two geoms, or both together
+OUTDATED = ("apply_api_compatibility", "autoreset")  # fields of Gymnasium before 1.0, which later ones refuse
 SINCE = {EARLIER: "before 3.5", ADDED: "3.5 and later"}  # the MuJoCo versions whose rule it is
 
 
@@ -27,4 +28,5 @@ def without_margin(spec: str) -> tuple[str, str]:
     rule = fields.pop(MARGIN, EARLIER)
     if rule not in (EARLIER, ADDED):
         raise OffbenchError(f"{MARGIN} must be {EARLIER} or {ADDED}, not {rule!r}")
-    return (json.dumps(fields) if MARGIN in spec else spec), rule
+    plain = {name: value for name, value in fields.items() if name not in OUTDATED}
+    return (spec if plain == fields and MARGIN not in spec else json.dumps(plain)), rule

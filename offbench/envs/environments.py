@@ -10,7 +10,9 @@ The EnvSpecs that offbench passes around, and keeps in runs, may have a field th
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
+import multiprocessing
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -19,11 +21,16 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from offbench.common.errors import OffbenchError
+from offbench.common.arrays import Array
+from offbench.common.errors import OffbenchError, drawing_variable
 from offbench.envs.contact_margin import EARLIER, MARGIN, without_margin
 from offbench.envs.trust import check_code
 
 WHAT_MATTERS = ("id", "kwargs", "max_episode_steps")  # with the contact margins, what makes two specs the same
+LARGEST_BOUND = 1e6  # of actions; what has larger ones, such as float32's largest number, has none
+LONGEST = 50_000  # steps that an episode may take in an environment without a time limit
+LARGEST_LIMIT = 1_000_000  # a time limit beyond this is none
+ELSEWHERE = "`offbench train` and `offbench evaluate` take --env RECIPE"
 
 
 def env_spec(env_id: str, **kwargs: Any) -> str:
@@ -38,29 +45,59 @@ def env_spec(env_id: str, **kwargs: Any) -> str:
         assert env.spec is not None
         text = env.spec.to_json()
     except Exception as error:  # a third-party environment may raise anything here
-        hint = ""
+        hint = _remedy(error)
         if isinstance(error, gym.error.NameNotFound | gym.error.NamespaceNotFound) and ":" not in env_id:
-            hint = f" If a module of yours registers it, name it before a colon: my_module:{env_id}"
-        raise OffbenchError(f"cannot make the environment {env_id!r}: {_reason(error)}{hint}") from error
+            hint = f". If a module of yours registers it, name it before a colon: my_module:{env_id}"
+        raise OffbenchError(f"cannot make the environment {env_id!r}: {reason(error).rstrip('.')}{hint}") from error
+    _check_importable(env.spec)
     _check_spaces(env, env_id)
+    _warn_endless(env_id, env.spec)
     return text
 
 
-def checked_spec(text: str, where: str, observation_dim: int, action_dim: int) -> str:
-    """Return the EnvSpec JSON that a file carries if it can be believed, made, and fits.
+def checked_spec(text: str, where: str, observation_dim: int, low: Array, high: Array) -> str:
+    """Return the EnvSpec JSON that a file carries if it can be trusted, made, and has the file's shapes.
+
+    Warns on stderr if the environment takes actions within other bounds than `low` and `high`, [act] each, or may
+    never end.
 
     Raises:
         OffbenchError: it names code that is no Gymnasium environment, cannot be made, or has other shapes.
     """
-    env = believed_env(text, where)
-    _check_spaces(env, where)
+    with contextlib.suppress(Exception):  # whatever is wrong with it, believed_env reports
+        spec = EnvSpec.from_json(without_margin(text)[0])
+        _warn_endless(spec.id, spec)
+    try:
+        env = believed_env(text, where)
+        _check_spaces(env, where)
+    except OffbenchError as error:
+        raise OffbenchError(f"{error}; or evaluate in another environment: {ELSEWHERE}") from error
+    name = env.spec.id if env.spec else "?"
     shapes = (env.observation_space.shape, env.action_space.shape)
-    if shapes != ((observation_dim,), (action_dim,)):
+    if shapes != ((observation_dim,), low.shape):
         raise OffbenchError(
-            f"{where} takes observations ({observation_dim},) and actions ({action_dim},); the environment "
-            f"{env.spec.id if env.spec else '?'} has {shapes[0]} and {shapes[1]}: give the right one"
+            f"{where} has observations ({observation_dim},) and actions {low.shape}; the environment {name} has "
+            f"{shapes[0]} and {shapes[1]}: give the right one with --env ({ELSEWHERE})"
+        )
+    actions: Any = env.action_space
+    if not same_bounds(actions, low, high):
+        print(
+            f"offbench: warning: {where} has actions with bounds {_bounds(low, high)}, the environment {name} takes "
+            f"{_bounds(actions.low, actions.high)}: returns in it are not those of the data's task",
+            file=sys.stderr,
         )
     return text
+
+
+def same_bounds(space: gym.spaces.Box, low: Array, high: Array) -> bool:
+    """Return whether a space has these bounds, but for rounding to float32."""
+    return bool(np.allclose(space.low, low, 1e-6, 1e-6) and np.allclose(space.high, high, 1e-6, 1e-6))
+
+
+def _bounds(low: Array, high: Array) -> str:
+    if len(np.unique(low)) == len(np.unique(high)) == 1:
+        return f"[{low.flat[0]:g}, {high.flat[0]:g}]"
+    return ", ".join(f"[{a:g}, {b:g}]" for a, b in zip(low.flat, high.flat, strict=True))
 
 
 def believed_env(text: str, where: str) -> gym.Env[Any, Any]:
@@ -70,14 +107,54 @@ def believed_env(text: str, where: str) -> gym.Env[Any, Any]:
         OffbenchError: it names code that is no Gymnasium environment, or cannot be made.
     """
     try:
-        check_code(EnvSpec.from_json(without_margin(text)[0]))
+        spec = EnvSpec.from_json(without_margin(text)[0])
+        _check_importable(spec)
+        for wrapper in spec.additional_wrappers:
+            if wrapper.kwargs is None:
+                raise OffbenchError(
+                    f"its environment {spec.id} cannot be made again: the wrapper {wrapper.name} does not record its "
+                    "arguments"
+                )
+        check_code(spec)
         return make_env(text)
     except OffbenchError as error:
         raise OffbenchError(f"{where}: {error}") from None
     except Exception as error:  # see env_spec
         raise OffbenchError(
-            f"{where}: cannot make its environment: {_reason(error)}; install or import the package it comes from"
+            f"{where}: cannot make its environment: {reason(error).rstrip('.')}{_remedy(error)}"
         ) from error
+
+
+def _check_importable(spec: EnvSpec | None) -> None:
+    """Refuse an environment of the script itself: worker processes could not make it."""
+    points = [spec.entry_point, *(wrapper.entry_point for wrapper in spec.additional_wrappers)] if spec else []
+    if spec and any(str(point).startswith("__main__:") for point in points):
+        raise OffbenchError(
+            f"the environment {spec.id} is defined in the script itself (__main__), where worker processes cannot "
+            "import it; move it into a module and register it there"
+        )
+
+
+def time_limit(spec: EnvSpec | None) -> int | None:
+    """Return the steps after which an environment truncates, None if it has no time limit."""
+    limit = spec.max_episode_steps if spec else None
+    for wrapper in spec.additional_wrappers if spec else ():
+        limit = (wrapper.kwargs or {}).get("max_episode_steps", limit) if wrapper.name == "TimeLimit" else limit
+    return limit if isinstance(limit, int) and 0 < limit <= LARGEST_LIMIT else None
+
+
+def _warn_endless(name: str, spec: EnvSpec | None) -> None:
+    """Say, once, that an environment has no time limit, before an episode of it can go on for ever."""
+    if time_limit(spec) is None and name not in _endless and multiprocessing.parent_process() is None:
+        _endless.add(name)
+        print(
+            f"offbench: warning: {name} has no time limit (max_episode_steps): an episode that does not end within "
+            f"{LONGEST:,} steps is an error",
+            file=sys.stderr,
+        )
+
+
+_endless: set[str] = set()  # environments that a warning was printed for
 
 
 def make_env(spec: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
@@ -160,17 +237,26 @@ def same_environment(a: str | None, b: str | None) -> bool:
     return same and first.get(MARGIN, EARLIER) == second.get(MARGIN, EARLIER)
 
 
-def _reason(error: Exception) -> str:
+def reason(error: BaseException) -> str:
+    """Return the first line of an exception's text, or its kind."""
     lines = str(error).strip().splitlines()
     return lines[0] if lines else type(error).__name__
+
+
+def _remedy(error: BaseException) -> str:
+    """Return what to do about an environment that cannot be made, "" where nothing general helps."""
+    if variable := drawing_variable(error):
+        return f"; unset {variable}"
+    package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+    if package and importlib.util.find_spec(package) is None:
+        return f"; install the package that has the module {package}"
+    return ""
 
 
 def _check_spaces(env: gym.Env[Any, Any], where: str) -> None:
     try:
         box(env.observation_space, f"{where}: observations")
-        actions = box(env.action_space, f"{where}: actions")
-        if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
-            raise OffbenchError(f"{where}: actions must be bounded, the action space is {actions}")
+        action_box(env.action_space, f"{where}: actions")
     finally:
         env.close()
 
@@ -178,7 +264,31 @@ def _check_spaces(env: gym.Env[Any, Any], where: str) -> None:
 def box(space: gym.Space[Any], what: str) -> gym.spaces.Box:
     """Return `space` if it is a flat float Box, else raise an OffbenchError that begins with `what`."""
     if not isinstance(space, gym.spaces.Box):
-        raise OffbenchError(f"{what} must be a Box space, not {space}; wrap the environment to make it one")
-    if len(space.shape) != 1 or not np.issubdtype(space.dtype, np.floating):
-        raise OffbenchError(f"{what} must be a flat Box of floats, not {space}; wrap it in FlattenObservation")
+        raise OffbenchError(f"{what} must be a Box space, not {space}; {_flattened(what)}")
+    if not np.issubdtype(space.dtype, np.floating):
+        raise OffbenchError(f"{what} must be floats, not {space}; convert them and their space to float32")
+    if len(space.shape) != 1:
+        raise OffbenchError(f"{what} must be a flat Box, not {space}; {_flattened(what)}")
     return space
+
+
+def _flattened(what: str) -> str:
+    if "observation" in what:
+        return "wrap the environment in FlattenObservation and record it again"
+    return "offbench's algorithms choose continuous actions, one number for each dimension"
+
+
+def action_box(space: gym.Space[Any], what: str) -> gym.spaces.Box:
+    """Return `space` if it is a flat float Box with bounds that actions can be scaled by, else raise OffbenchError."""
+    found = box(space, what)
+    if not (np.isfinite(found.low).all() and np.isfinite(found.high).all()):
+        raise OffbenchError(f"{what} must be bounded to be scaled, not {found}")
+    largest = max(np.abs(found.low).max(), np.abs(found.high).max())
+    if largest > LARGEST_BOUND:
+        raise OffbenchError(
+            f"{what} must be bounded to be scaled; a bound of {largest:.3g} is none (at most {LARGEST_BOUND:,.0f}): "
+            "correct the action space to what the environment takes"
+        )
+    if not (found.low < found.high).all():
+        raise OffbenchError(f"{what}: a lower bound is not below its upper bound in {found}; correct the action space")
+    return found

@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import importlib.resources
 import json
+import re
 import tomllib
 from dataclasses import dataclass
 from fractions import Fraction
@@ -113,7 +114,7 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
     """Read one recipe file. `folder` is where its behaviour weights are shipped, if they are."""
     where = str(path) if folder is None else f"recipe of {folder.name}"
     try:
-        with damage(f"{where}: not a readable TOML file", "correct it, or name another"):
+        with damage(where, "is not a readable TOML file", "correct it, or name another"):
             values = tomllib.loads(read_text(path))
     except FileNotFoundError:
         raise OffbenchError(f"no recipe file {path}; write one, or name a shipped one: {', '.join(names())}") from None
@@ -168,11 +169,29 @@ def _check(recipe: Recipe, where: str) -> None:
         raise OffbenchError(f"{where}: [sac] segment must be a multiple of {turn} (envs x the steps of a turn)")
 
 
-def d4rl_constants(env_id: str) -> tuple[float, float] | None:
-    """Return D4RL's reference scores for an environment by its family (Hopper-v2 to -v5), None if it has none."""
-    family = env_id.split("/")[-1].rpartition("-v")[0]
-    for name in names():
-        recipe = load_recipe(name)
-        if recipe.d4rl_min is not None and recipe.d4rl_max is not None and recipe.env_id.startswith(f"{family}-v"):
-            return recipe.d4rl_min, recipe.d4rl_max
-    return None
+D4RL_TASK = re.compile(r"(\w+)-v[2-5]", re.ASCII)
+D4RL_CODE = ("gymnasium.envs.mujoco", "gym.envs.mujoco")
+D4RL_LIMIT = 1000  # steps of an episode of D4RL's MuJoCo tasks
+WATCHING = {"OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics"}  # wrappers that change nothing
+VIEW = {"render_mode", "width", "height", "camera_id", "camera_name", "default_camera_config"}
+
+
+def d4rl_reference(spec: str | None) -> tuple[float, float] | None:
+    """Return D4RL's reference returns (random, expert) of an environment (EnvSpec JSON).
+
+    They hold for the standard task alone (its versions v2 to v5): None for any other environment, and where arguments,
+    time limit or wrappers are not the standard ones.
+    """
+    fields = json.loads(spec or "{}")
+    task = D4RL_TASK.fullmatch(str(fields.get("id")))
+    recipe = next((r for r in map(load_recipe, names()) if task and r.env_id.startswith(f"{task[1]}-v")), None)
+    if task is None or recipe is None or recipe.d4rl_min is None or recipe.d4rl_max is None:
+        return None
+    wrappers = {str(wrapper.get("name")) for wrapper in fields.get("additional_wrappers") or ()}
+    standard = (
+        str(fields.get("entry_point")).startswith(D4RL_CODE)
+        and fields.get("max_episode_steps") == D4RL_LIMIT
+        and not (fields.get("kwargs") or {}).keys() - VIEW
+        and wrappers <= WATCHING
+    )
+    return (recipe.d4rl_min, recipe.d4rl_max) if standard else None

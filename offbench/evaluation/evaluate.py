@@ -20,7 +20,7 @@ from offbench.common.seeds import Purpose, generator
 from offbench.common.text import counted
 from offbench.envs.contact_margin import ADDED, SINCE, without_margin
 from offbench.envs.environments import checked_spec, env_spec, same_environment
-from offbench.envs.recipes import d4rl_constants, load_recipe
+from offbench.envs.recipes import d4rl_reference, load_recipe
 from offbench.envs.trust import REMEDY, is_trusting
 from offbench.rollouts.policy import Policy, load_policy
 from offbench.rollouts.rollouts import Rollouts, result
@@ -93,7 +93,7 @@ def evaluate(
     if config is not None and same_environment(config.env_spec, spec):
         references = config.references
     else:
-        references = {"dataset": shipped_references(spec), "d4rl": d4rl_constants(played)}
+        references = {"dataset": shipped_references(spec), "d4rl": d4rl_reference(spec)}
     scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in references.items() if pair}
     physics = f" with contact margins as in MuJoCo {SINCE[ADDED]}" if without_margin(spec)[1] == ADDED else ""
     return Evaluation(str(path), played, returns, [o.length for o in outcomes], scores, physics)
@@ -197,4 +197,4 @@ def open_policy(path: Path, env: str | None = None) -> tuple[Policy, RunConfig |
         text = env_spec(_registered(policy.env_id, path))
     else:
         raise OffbenchError(f"{path} names no environment; give one with --env")
-    return policy, config, checked_spec(text, str(path), len(policy.observation_mean), len(policy.low))
+    return policy, config, checked_spec(text, str(path), len(policy.observation_mean), policy.low, policy.high)

@@ -50,14 +50,18 @@ def _draws(backend: str) -> bool:
 
 @contextlib.contextmanager
 def drawing_with(backend: str | None) -> Iterator[None]:
-    """Let MuJoCo draw with `backend`, which it reads from the environment; None leaves things as they are."""
-    before = os.environ.get(KEY)
+    """Let MuJoCo draw with `backend`, which it reads from the environment; None leaves things as they are.
+
+    PyOpenGL's own variable is left out: MuJoCo refuses to load if it names another renderer.
+    """
+    before = {name: os.environ.get(name) for name in (KEY, "PYOPENGL_PLATFORM")}
     if backend:
+        os.environ.pop("PYOPENGL_PLATFORM", None)
         os.environ[KEY] = backend
     try:
         yield
     finally:
-        if before is None:
-            os.environ.pop(KEY, None)
-        else:
-            os.environ[KEY] = before
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value

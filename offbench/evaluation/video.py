@@ -7,6 +7,7 @@ A film runs in real time: k follows from the environment's own frame rate (125 s
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -17,9 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-import mujoco
 import numpy as np
-from gymnasium.envs.mujoco import MujocoEnv
 
 from offbench.agents.ladder import BEHAVIOUR, find_ladder
 from offbench.common import seeds
@@ -27,11 +26,12 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import disk_errors, output_file, write_bytes
 from offbench.common.seeds import Purpose
 from offbench.data.levels import SINGLE, parse_level
-from offbench.envs.environments import make_env
+from offbench.envs.environments import make_env, time_limit
 from offbench.envs.recipes import load_recipe
 from offbench.evaluation.evaluate import open_policy
 from offbench.evaluation.renderer import NO_RENDERER, drawing_with, working_backend
 from offbench.rollouts.policy import Policy, uniform
+from offbench.rollouts.rollouts import number
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -76,10 +76,14 @@ def video(
         raise OffbenchError(f"a video's file ends in {' or '.join(ENDINGS)}, not {target.name!r}")
     if min(episodes, fps, size) < 1 or (seconds is not None and seconds <= 0):
         raise OffbenchError("episodes, seconds, fps and size must be more than 0")
-    policy, spec, sampled = _who(str(path), env)
     encode = _gif if target.suffix.lower() == ".gif" else _encoder()
     backend = working_backend()
-    with drawing_with(backend), _drawable(spec, backend) as world:
+    with contextlib.ExitStack() as drawing:
+        drawing.enter_context(drawing_with(backend))  # before MuJoCo is loaded, which chooses its renderer then
+        policy, spec, sampled = _who(str(path), env)
+        world = drawing.enter_context(_drawable(spec, backend))
+        if seconds is None and time_limit(world.spec) is None:
+            raise OffbenchError(f"{json.loads(spec)['id']} has no time limit (max_episode_steps); give --seconds")
         rate = float(world.metadata.get("render_fps") or fps)
         every = max(1, round(rate / fps))
         most = seconds * rate if seconds else float("inf")
@@ -120,8 +124,10 @@ def _drawable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
             env = make_env(spec, "rgb_array")
     except Exception as error:  # a third party's environment may raise anything here
         raise OffbenchError(f"{json.loads(spec)['id']} cannot be filmed (render_mode rgb_array): {error}") from error
-    world = env.unwrapped
-    if isinstance(world, MujocoEnv):
+    world: Any = env.unwrapped
+    if hasattr(world, "mujoco_renderer"):
+        import mujoco
+
         if backend is None:
             env.close()
             raise OffbenchError(NO_RENDERER)
@@ -160,7 +166,7 @@ def _episode(film: _Film, seed: int, index: int, most: float) -> Generator[Image
     while not over:
         noise = policy.draw(rng, 1) if noisy else None
         observation, reward, terminated, truncated, _ = env.step(policy.act(np.asarray(observation)[None], noise)[0])
-        step, total = step + 1, total + float(reward)
+        step, total = step + 1, total + number(reward)
         over = bool(terminated or truncated or step >= most)
         if over or step % film.every == 0:
             yield _frame(env, step, total, film.size)

@@ -191,7 +191,7 @@ def uniform(low: Array, high: Array, observation_dim: int, env_id: str) -> Polic
 def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Read a policy file. Raises OffbenchError if it is not one, or is damaged."""
     try:
-        with damage(f"{path} is not a readable policy file", "give another, or write it again"):
+        with damage(str(path), "is not a readable policy file", "give another, or write it again"):
             return from_bytes(read_bytes(Path(path)))
     except FileNotFoundError:
         raise OffbenchError(f"no policy file {path}") from None

@@ -27,11 +27,11 @@ import numpy.typing as npt
 
 from offbench.common import seeds
 from offbench.common.arrays import Array
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import SHOW_TRACEBACK, OffbenchError
 from offbench.common.processes import closing, quiet_start, start_errors, start_worker
 from offbench.common.scores import interval
 from offbench.common.seeds import Purpose
-from offbench.envs.environments import make_env
+from offbench.envs.environments import LONGEST, make_env, reason, time_limit
 from offbench.rollouts.policy import Policy, from_bytes
 
 LANES = 16  # episodes that share a policy forward
@@ -116,7 +116,11 @@ class _Lane:
         self.env, self.policy, self.slot = env, policy, slot
         self.seed = seeds.integer(task.seed, Purpose.RESET, *task.stream, index)
         self.rng = seeds.generator(task.seed, Purpose.ACTION, *task.stream, index)
-        self.observations = [np.array(env.reset(seed=self.seed)[0])]  # a copy: environments may reuse their array
+        self.limit = time_limit(env.spec) or LONGEST
+        try:
+            self.observations = [np.array(env.reset(seed=self.seed)[0])]  # a copy: environments may reuse their array
+        except Exception as error:
+            raise _failed(env, error) from error
         self.actions: list[Array] = []
         self.rewards: list[float] = []
         self.noise: Array = np.empty((0, 0))
@@ -130,16 +134,46 @@ class _Lane:
 
     def step(self, action: Array) -> Episode | None:
         """Take one step; return the whole episode if it was the last one."""
-        observation, reward, terminated, truncated, _ = self.env.step(action)
-        self.observations.append(np.array(observation))
-        self.actions.append(action)
-        self.rewards.append(float(reward))
-        if not (terminated or truncated):
+        try:
+            observation, reward, terminated, truncated, _ = self.env.step(action)
+            self.observations.append(np.array(observation))
+            self.actions.append(action)
+            self.rewards.append(number(reward))
+            over = bool(terminated or truncated)
+        except Exception as error:
+            raise _failed(self.env, error) from error
+        if not over:
+            if len(self.rewards) > self.limit:
+                raise OffbenchError(
+                    f"an episode of {_name(self.env)} has not ended within {self.limit:,} steps; give the environment "
+                    "a time limit (max_episode_steps)"
+                )
             return None
         rewards = np.array(self.rewards)
         # a step that both terminates and runs out of time has terminated: nothing is left to bootstrap from
         ends = (bool(terminated), bool(truncated and not terminated))
         return Episode(self.seed, np.array(self.observations), np.array(self.actions), rewards, *ends)
+
+
+def number(reward: Any) -> float:
+    """Return a reward as a number; an array of one element counts as one. Raises ValueError for any other."""
+    if isinstance(reward, np.ndarray):
+        if reward.size != 1:
+            raise ValueError(f"the reward is an array of shape {reward.shape}, not a number")
+        reward = reward.item()
+    return float(reward)
+
+
+def _failed(env: gym.Env[Any, Any], error: Exception) -> Exception:
+    """Return what to raise for an exception of an environment."""
+    if isinstance(error, OffbenchError | MemoryError):
+        return error
+    what = f"{type(error).__name__}: {reason(error)}"
+    return OffbenchError(f"the environment {_name(env)} failed: {what} ({SHOW_TRACEBACK})")
+
+
+def _name(env: gym.Env[Any, Any]) -> str:
+    return env.spec.id if env.spec else type(env.unwrapped).__name__
 
 
 def play(task: Task) -> list[Episode] | list[Outcome]:
@@ -184,7 +218,10 @@ def kept_envs(spec: str, count: int) -> list[gym.Env[Any, Any]]:
     """Return `count` environments of this process, made once and kept."""
     pool = _pool_of_envs(spec)
     while len(pool) < count:
-        pool.append(make_env(spec))
+        try:
+            pool.append(make_env(spec))
+        except Exception as error:  # a worker may lack what the process that started it has
+            raise OffbenchError(f"cannot make an environment in a worker process: {reason(error)}") from error
     return pool[:count]
 
 

@@ -22,7 +22,7 @@ from offbench.data import transitions
 from offbench.data.recorded_env import say_margin
 from offbench.data.transitions import Transitions
 from offbench.envs.environments import checked_spec, same_environment
-from offbench.envs.recipes import d4rl_constants
+from offbench.envs.recipes import d4rl_reference
 from offbench.envs.same_physics import warn_other_physics
 from offbench.training.devices import Machine, stack_size
 from offbench.training.run import RunConfig
@@ -44,7 +44,7 @@ def check_datasets(datasets: Datasets) -> None:
     """
     for name, data in datasets.items():
         if data.env_spec:
-            checked_spec(data.env_spec, name, data.observations.shape[1], data.actions.shape[1])
+            checked_spec(data.env_spec, name, data.observations.shape[1], data.low, data.high)
             say_margin(name, data.metadata, data.env_spec)
             warn_other_physics(name, data.metadata.get("offbench", {}).get("versions", {}), data.env_spec)
         else:
@@ -175,7 +175,7 @@ def _run_config(spec: RunSpec, data: Transitions, device: str, command: str) -> 
         steps=spec.steps,
         eval_every=spec.eval_every,
         eval_episodes=spec.eval_episodes,
-        references={"dataset": data.references, "d4rl": d4rl_constants(data.env_id)},
+        references={"dataset": data.references, "d4rl": d4rl_reference(data.env_spec)},
         env_id=data.env_id,
         env_spec=data.env_spec,
         command=command.encode("utf-8", "backslashreplace").decode(),  # a path may hold bytes that are not UTF-8

@@ -12,7 +12,7 @@ import types
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, unknown
+from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, drawing_variable, unknown
 from offbench.common.files import OPEN_FILES
 
 if TYPE_CHECKING:
@@ -76,6 +76,8 @@ def failure(error: Exception) -> str:
         where = f"{error.filename}: " if error.filename else ""
         remedy = f"; {OPEN_FILES[error.errno]}" if error.errno in OPEN_FILES else ""
         return f"{where}{error.strerror or error}{remedy} ({SHOW_TRACEBACK})"
+    if not algorithm and (variable := drawing_variable(error)):
+        return f"MuJoCo does not load with {variable} ({type(error).__name__}: {error}); unset it or choose another"
     frame = traceback.extract_tb(error.__traceback__)[-1]
     what = f"{type(error).__name__}: {error} (at {frame.filename}:{frame.lineno})"
     if algorithm:

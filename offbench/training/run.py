@@ -240,7 +240,7 @@ class Run:
         config = self.config() if self.config_path.exists() else None
         last, count = (config.steps, config.eval_episodes) if config else (LARGEST, 0)
         evaluations: dict[int, list[tuple[float, int]]] = {}
-        with damage(f"{self.evaluations_path} is damaged", "delete the run to repeat it"):
+        with damage(str(self.evaluations_path), "is damaged", "delete the run to repeat it"):
             with open(self.evaluations_path, newline="", encoding="utf-8", opener=regular) as file:
                 reader = csv.DictReader(file, strict=True)
                 if tuple(reader.fieldnames or ()) != EVALUATION_COLUMNS:
@@ -283,7 +283,7 @@ class Run:
         if not path.exists():
             return []
         with (
-            damage(f"{path} is damaged", "delete the run to repeat it"),
+            damage(str(path), "is damaged", "delete the run to repeat it"),
             open(path, newline="", encoding="utf-8", opener=regular) as file,
         ):
             return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]

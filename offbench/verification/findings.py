@@ -12,12 +12,16 @@ AGAIN = "record or download the dataset again"
 FAULTS: dict[str, tuple[str, str]] = {
     # code: (what it means, what to do)
     "unreadable": ("the files cannot be read", AGAIN),
+    "empty": ("there is no transition", AGAIN),
     "counts": ("the metadata's counts are not those of the data", AGAIN),
     "shape": ("arrays do not fit the spaces or each other (T + 1 observations, T of all else)", AGAIN),
     "dtype": ("numbers are of another type than their space", "convert them, or correct the space"),
     "not-finite": ("NaN or infinite numbers", "filter these episodes out of the dataset"),
     "outside-space": ("observations outside the observation space", "correct the space's bounds or the data"),
-    "action-bounds": ("actions outside the action space", "clip them to what the environment executed"),
+    "action-bounds": (
+        "actions outside the action space",
+        "clip them to what the environment executed; rewards that have an action cost then differ from its own",
+    ),
     "clipped-actions": (
         "actions are cut off at a bound that is not the space's: other actions were executed",
         "record what the environment was given",

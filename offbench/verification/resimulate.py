@@ -17,7 +17,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.data.minari_reader import Recorded
-from offbench.rollouts.rollouts import kept_envs
+from offbench.rollouts.rollouts import kept_envs, number
 
 STEPS = 40  # of an episode that are replayed one by one
 WHOLE, CLOSE, ROUNDED = 1e-9, 1e-6, 1e-4  # tolerances: same physics, other version, observations kept as float32
@@ -27,12 +27,13 @@ SHARE = 0.01  # of the replayed steps, or one of them, that rounding may carry a
 
 @dataclass(frozen=True)
 class Verdict:
-    """What playing an episode again showed. `faults` are (code, detail); `how` is seed, step or none."""
+    """What replaying an episode showed. `faults` are (code, detail); `how` is seed, step or none."""
 
     index: int
     how: str
     steps: int
     faults: tuple[tuple[str, str], ...] = ()
+    end: bool = True  # whether its last step was played, so that its end is checked
 
 
 def check(spec: str, episode: Recorded, exact: bool, last_unknown: bool) -> Verdict:
@@ -60,7 +61,7 @@ def _from_seed(env: gym.Env[Any, Any], e: Recorded, tolerance: float) -> Verdict
     for action in e.actions:
         observation, reward, terminated, truncated, _ = env.step(action)
         observations.append(np.array(observation))
-        rewards.append(float(reward))
+        rewards.append(number(reward))
         ends = (bool(terminated), bool(truncated))
         if any(ends):
             break
@@ -71,7 +72,7 @@ def _from_seed(env: gym.Env[Any, Any], e: Recorded, tolerance: float) -> Verdict
     over = ("steps-after-end", f"the environment ends at step {steps} of {len(e)}")
     if first_off is not None:
         # only the row behind the environment's own end: the next episode begins there
-        fault = over if first_off == steps < len(e) else _why(played, e, first_off, tolerance)
+        fault = over if first_off == steps < len(e) else _why(env, played, e, first_off, tolerance)
         return Verdict(e.index, "seed", steps, (fault,))
     faults = []
     earned = _off(np.array(rewards).astype(e.rewards.dtype), e.rewards[:steps], tolerance)
@@ -98,7 +99,7 @@ def _off(a: Array, b: Array, tolerance: float) -> Array:
     return np.asarray(far.reshape(len(far), -1).any(1))
 
 
-def _why(played: Array, e: Recorded, first: int, tolerance: float) -> tuple[str, str]:
+def _why(env: gym.Env[Any, Any], played: Array, e: Recorded, first: int, tolerance: float) -> tuple[str, str]:
     """Name the fault of an episode whose observations part from the environment's at row `first`."""
     rows = len(played)
     close = max(tolerance, CLOSE)
@@ -108,16 +109,19 @@ def _why(played: Array, e: Recorded, first: int, tolerance: float) -> tuple[str,
         return "shifted-observations", "row t holds what was there before action t - 1"
     if first == 0:
         return "other-start", f"by up to {np.abs(played[0] - e.observations[0]).max():.3g}"
-    if _piled(e.actions)[first - 1]:
+    if _piled(e.actions, env.action_space)[first - 1]:
         return "clipped-actions", f"the first step that does not follow its action is {first - 1}"
     return "other-physics", f"from row {first}, by {np.abs(played[first] - e.observations[first]).max():.3g} there"
 
 
-def _piled(actions: Array) -> Array:
-    """Return which steps [T] have an action at the outermost value of a component, if several steps share it."""
+def _piled(actions: Array, space: Any) -> Array:
+    """Return which steps [T] have an action at the outermost value of a component, if several steps share it.
+
+    At the space's own bounds that is no clipping after the fact: what lies beyond them is never executed.
+    """
     piled = np.zeros(len(actions), bool)
-    for outermost in (actions.min(0), actions.max(0)):
-        at = actions == outermost
+    for outermost, bound in ((actions.min(0), space.low), (actions.max(0), space.high)):
+        at = (actions == outermost) & ~np.isclose(outermost, bound)
         piled |= (at & (at.sum(0) > 2)).any(1)
     return piled
 
@@ -144,10 +148,13 @@ class _State:
         if not (hasattr(inner, "set_state") and hasattr(getattr(inner, "model", None), "nq")):
             return None
         dim = env.observation_space.shape[0]  # type: ignore[index]
-        known = getattr(inner, "observation_structure", {})
-        skipped = known.get("skipped_qpos", max(0, inner.model.nq + inner.model.nv - dim))
-        state = cls(inner, skipped)
-        return state if 0 < state.size <= dim and state._works(env) else None
+        # the positions that are left out are x (and y); older versions of the environments do not say which
+        said = getattr(inner, "observation_structure", {}).get("skipped_qpos")
+        for skipped in (0, 1, 2) if said is None else (said,):
+            state = cls(inner, skipped)
+            if 0 < state.size <= dim and state._works(env):
+                return state
+        return None
 
     def _works(self, env: gym.Env[Any, Any]) -> bool:
         """Try it: a step from a set state must lead where the same step leads without setting it."""
@@ -163,7 +170,7 @@ class _State:
         after = np.array(observation)
         self.set(before)
         again, repaid, *_ = env.step(action)
-        self.rewards = abs(float(repaid) - float(reward)) <= WHOLE * (1 + abs(float(reward)))
+        self.rewards = abs(number(repaid) - number(reward)) <= WHOLE * (1 + abs(number(reward)))
         return not _off(np.array(again)[None, : self.size], after[None, : self.size], WHOLE).any()
 
 
@@ -183,7 +190,7 @@ def _one_step(env: gym.Env[Any, Any], state: _State, e: Recorded, exact: bool, l
         state.set(seen[t])
         observation, reward, ended[i], *_ = env.step(e.actions[t])
         moved[i] = _far(observation, seen[t + 1], state, tolerance)
-        paid[i] = abs(float(reward) - float(e.rewards[t])) > tolerance * (1 + abs(float(reward)))
+        paid[i] = abs(number(reward) - float(e.rewards[t])) > tolerance * (1 + abs(number(reward)))
     allowed = max(1, SHARE * len(steps)) if rounded else 0
     early = ended & (steps != last)
     moved &= ~early  # what follows an end is another episode
@@ -196,7 +203,7 @@ def _one_step(env: gym.Env[Any, Any], state: _State, e: Recorded, exact: bool, l
         faults.append(("steps-after-end", f"the environment ends at step {steps[early][0] + 1} of {len(e)}"))
     if steps[-1] == last:
         faults += _ends(bool(e.terminations[-1]), bool(ended[-1]), len(e))
-    return Verdict(e.index, "step", len(steps), tuple(faults))
+    return Verdict(e.index, "step", len(steps), tuple(faults), end=bool(steps[-1] == last))
 
 
 def _far(observation: Array, recorded: Array, state: _State, tolerance: float) -> bool:
@@ -217,6 +224,6 @@ def _why_step(
             off.append(_far(observation, e.observations[t + 1].astype(np.float64), state, tolerance))
         if near and sum(off) < 0.2 * len(near) < sum(moved):
             return "shifted-observations", words
-    if _piled(e.actions)[steps[moved]].all():
+    if _piled(e.actions, env.action_space)[steps[moved]].all():
         return "clipped-actions", f"{moved.sum()} of {len(steps)} steps do not follow their actions"
     return "other-physics", f"{moved.sum()} of {len(steps)} steps lead elsewhere"

@@ -13,16 +13,16 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from offbench.common import seeds
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.processes import default_workers
 from offbench.common.provenance import versions
 from offbench.common.seeds import Purpose
 from offbench.common.text import counted
 from offbench.data import minari_store
-from offbench.data.minari_reader import Recorded, episodes_of
+from offbench.data.minari_reader import Recorded, episodes_of, reading
 from offbench.data.recorded_env import margins_matter, recorded_margin, recorded_mujoco
 from offbench.envs.contact_margin import ADDED, EARLIER, SINCE, with_margin
-from offbench.envs.environments import believed_env, box
+from offbench.envs.environments import believed_env, box, same_bounds
 from offbench.rollouts.rollouts import Rollouts, result
 from offbench.verification.findings import Findings, Report
 from offbench.verification.metadata import check_claims
@@ -32,6 +32,7 @@ from offbench.verification.scan import Survey, survey
 EPISODES = 300  # played again by default: half a minute for a million transitions
 SOME = 10  # of them tell the rule for contact margins, about
 REQUIREMENT = {EARLIER: "mujoco<3.5", ADDED: "mujoco>=3.5"}
+SEVERAL = 3  # terminations at the time limit, and none elsewhere, are no coincidence
 FEW = 20_000  # steps to play again that are not worth worker processes
 
 
@@ -60,20 +61,24 @@ def verify(dataset_id: str, *, episodes: int | None = None, workers: int | None 
         metadata = minari_store.read_metadata(dataset_id)
         code = "unreadable"
         data = open_minari(dataset_id)
-    except OffbenchError as error:
+    except DamagedError as error:
         findings.add(code, dataset_id, str(error))
         return dataclasses.replace(report, findings=findings.all())
     box(data.observation_space, f"{dataset_id}: observations")
     box(data.action_space, f"{dataset_id}: actions")
     spec = metadata.get("env_spec")
     try:
-        found = survey(data, _limit(spec), findings)
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError, AssertionError) as error:
+        with reading(dataset_id):
+            found = survey(data, _limit(spec), findings)
+    except DamagedError as error:
         findings.add("unreadable", dataset_id, str(error))
         return dataclasses.replace(report, findings=findings.all())
     report.transitions, report.episodes = found.steps, len(found.lengths)
     report.checked.append("every episode: shapes, types, ends, finite numbers, bounds, duplicates, seeds")
+    if not found.steps:
+        findings.add("empty", dataset_id)
     _counts(metadata, dataset_id, found, findings)
+    _terminations(found, _limit(spec), findings)
     last = check_claims(minari_store.provenance(metadata), found, _limit(spec), report, findings)
     chosen = _choose(found, _limit(spec), last, episodes)
     _play(data, chosen, found, metadata, workers, report, findings)
@@ -98,6 +103,14 @@ def _counts(metadata: dict[str, Any], dataset_id: str, found: Survey, findings: 
         findings.add("metadata", "metadata", f"it calls itself {metadata.get('dataset_id')!r}")
 
 
+def _terminations(found: Survey, limit: int | None, findings: Findings) -> None:
+    """Report an environment's clock marked as termination: every termination lies exactly at the time limit."""
+    lengths = [length for length, (terminated, _) in zip(found.lengths, found.ended, strict=True) if terminated]
+    if limit is not None and len(lengths) >= SEVERAL and set(lengths) == {limit}:
+        detail = f"all {len(lengths):,} terminations lie exactly at the time limit of {limit:,} steps"
+        findings.add("timeouts-as-terminations", "ends", detail)
+
+
 def _play(
     data: Any,
     chosen: Sequence[int],
@@ -111,6 +124,8 @@ def _play(
     spec = metadata.get("env_spec")
     if not spec:
         report.skipped.append("playing episodes again: the dataset names no environment")
+        return
+    if not found.steps:
         return
     if not chosen or not _same_spaces(spec, data, report, findings):
         return
@@ -151,7 +166,7 @@ def _same_spaces(spec: str, data: Any, report: Report, findings: Findings) -> bo
         return False
     theirs: Any = env.action_space
     same = env.observation_space.shape == data.observation_space.shape and theirs.shape == data.action_space.shape
-    same = same and bool((theirs.low == data.action_space.low).all() and (theirs.high == data.action_space.high).all())
+    same = same and same_bounds(theirs, data.action_space.low, data.action_space.high)
     env.close()
     if not same:
         findings.add("other-spaces", "metadata", f"{env.observation_space} and {theirs}")
@@ -179,6 +194,10 @@ def _tell(verdicts: Sequence[Verdict], mujoco: str | None, report: Report, findi
         if played:
             steps = sum(verdict.steps for verdict in played)
             report.checked.append(f"{counted(len(played), 'episode')} played again {words}: {counted(steps, 'step')}")
+    open_ends = sum(verdict.how != "none" and not verdict.end for verdict in verdicts)
+    if open_ends:
+        words = f"the {'ends' if open_ends > 1 else 'end'} of {counted(open_ends, 'episode')}"
+        report.skipped.append(f"{words}: the last step cannot be played from its observation")
     left = sum(verdict.how == "none" for verdict in verdicts)
     if left:
         words = f"playing {counted(left, 'episode')} again"

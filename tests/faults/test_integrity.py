@@ -270,5 +270,5 @@ def test_an_error_in_an_installed_algorithm_keeps_its_traceback(
 
 def test_damage_brings_no_error_of_a_parser_out() -> None:
     for error in (MemoryError(), RecursionError(), KeyError("x"), StopIteration(), AssertionError("odd")):
-        with pytest.raises(OffbenchError, match="delete it"), files.damage("a.bin is damaged", "delete it"):
+        with pytest.raises(OffbenchError, match="delete it"), files.damage("a.bin", "is damaged", "delete it"):
             raise error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -16,7 +17,7 @@ from offbench.data import minari_store
 from offbench.envs.environments import env_spec, make_env
 from offbench.rollouts.rollouts import Episode
 from offbench.verification.verify import verify
-from tests.verification.test_verify import change_metadata, codes, each, hopper, tamper
+from tests.verification.test_verify import change_metadata, codes, each, hopper, metadata_path, replace, tamper
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -26,10 +27,18 @@ with warnings.catch_warnings():
 __all__ = ["hopper"]  # a fixture
 
 
-def recorded(name: str, env_id: str, change: Callable[[Any], None], seeded: bool = True, steps: int = 300) -> str:
+def recorded(
+    name: str,
+    env_id: str,
+    change: Callable[[Any], None],
+    seeded: bool = True,
+    steps: int = 300,
+    rng: Any = None,
+    **kwargs: Any,
+) -> str:
     """Record random actions in an environment that `change` has had its hands on, as if it were the real one."""
-    spec = env_spec(env_id)
-    env, rng = make_env(spec), np.random.default_rng(0)
+    spec = env_spec(env_id, **kwargs)
+    env, rng = make_env(spec), rng or np.random.default_rng(0)
     change(env.unwrapped)
     low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
 
@@ -120,3 +129,55 @@ def test_a_foreign_recording_with_seeds_is_played_again() -> None:
     report = verify("theirs-v0", workers=1)
     assert report.ok, report.lines()
     assert any("5 episodes played again from their seeds, bit for bit" in line for line in report.checked)
+
+
+def saturated(name: str, env_id: str, change: Callable[[Any], None], seeded: bool) -> str:
+    """Record as `recorded` does, every action at one of the space's bounds."""
+
+    class Bounds:
+        def uniform(self, low: Any, high: Any) -> Any:
+            return np.where(self.rng.random(low.shape) < 0.5, low, high)
+
+        rng = np.random.default_rng(0)
+
+    return recorded(name, env_id, change, seeded, rng=Bounds())
+
+
+@pytest.mark.parametrize("seeded", [True, False])
+def test_actions_at_the_spaces_bounds_are_not_clipped(seeded: bool) -> None:
+    """What lies beyond them is never executed, so it is the physics that differ."""
+    assert codes(saturated("sound-v0", "Hopper-v5", nothing, seeded)) == set()
+    assert codes(saturated("heavier-v0", "Hopper-v5", heavier, seeded)) == {"other-physics"}
+
+
+def test_ant_of_version_4_is_played_again() -> None:
+    """111 observations: contact forces too, and no word of the two positions that are left out."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        kwargs = {"use_contact_forces": True}
+        report = verify(recorded("ant-v0", "Ant-v4", nothing, seeded=False, **kwargs), workers=1)
+        assert report.ok, report.lines()
+        assert any("4 episodes played again one step at a time" in line for line in report.checked)
+        assert codes(recorded("heavier-v0", "Ant-v4", heavier, seeded=False, **kwargs)) == {"other-physics"}
+
+
+def test_ends_that_cannot_be_played_are_listed_as_skipped() -> None:
+    """An import without final observations: the last step of a terminated episode leads to a stand-in."""
+    name = recorded("repeated-v0", "InvertedPendulum-v5", nothing, seeded=False)
+    assert not any("ends of" in line for line in verify(name, workers=1).skipped)
+    metadata = minari_store.read_metadata(name)
+    metadata["offbench"]["final_observations"] = "repeated"
+    metadata_path(name).write_text(json.dumps(metadata))
+    assert any("the ends of 4 episodes" in line for line in verify(name, workers=1).skipped)
+
+
+def test_terminations_at_the_time_limit_alone_are_told_without_playing() -> None:
+    def mark(file: h5py.File) -> None:
+        for group in each(file):
+            replace(group, "terminations", np.arange(len(group["rewards"])) == len(group["rewards"]) - 1)
+            replace(group, "truncations", np.zeros(len(group["rewards"]), bool))
+
+    name = tamper(recorded("clock-v0", "HalfCheetah-v5", nothing, steps=20, max_episode_steps=20), mark)
+    report = verify(name, workers=1, episodes=0)
+    found = {finding.code: finding.what for finding in report.findings}
+    assert "all 4 terminations lie exactly at the time limit of 20" in found["timeouts-as-terminations"]
