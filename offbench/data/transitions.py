@@ -39,6 +39,7 @@ ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "return
 ATTEMPTS = 3  # to read a dataset that is replaced meanwhile
 NUMBERS = ("observations", "actions", "rewards")
 LARGEST = float(np.finfo(np.float32).max)
+LEAST_USED = 1e-3  # of the range between the action bounds
 CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding are worth a warning
 
 
@@ -300,4 +301,10 @@ def _scaled(actions: Array, space: gym.spaces.Box, dataset_id: str) -> Array:
     outside = int((np.abs(scaled) > 1 + CLIP_TOLERANCE).any(1).sum())
     if outside:
         print(f"offbench: warning: {dataset_id}: {outside} actions out of bounds were clipped", file=sys.stderr)
+    if 0 < (used := float((scaled.max(0) - scaled.min(0)).max()) / 2) < LEAST_USED:
+        print(
+            f"offbench: warning: {dataset_id}: actions use {used:.1g} of the range between the action space's bounds, "
+            "which policies can hardly resolve; correct the action space to what the environment takes",
+            file=sys.stderr,
+        )
     return np.clip(scaled, -1, 1).astype(np.float32)

@@ -157,3 +157,36 @@ def test_a_dataset_without_references_trains_and_scores_nothing(home: Path) -> N
     (folder,) = offbench.train("td3_bc", name, steps=20, eval_every=10, hidden=(8,), batch_size=4)
     assert (folder / "policy.safetensors").exists()
     assert not (folder / "evaluations.csv").read_text().splitlines()[1:]
+
+
+@pytest.mark.parametrize("column", ["observations", "rewards"])
+@pytest.mark.parametrize("value", [1e60, -1e39, 2**70])
+def test_numbers_beyond_float32_are_called_that(column: str, value: float, recwarn: pytest.WarningsRecorder) -> None:
+    sound = episode(3, 0, True)
+    large = sound[column].copy()
+    large[1] = value
+    foreign("large-v0", [sound | {column: large}])
+    if abs(value) < 3e38:
+        offbench.load("large-v0")
+        return
+    with pytest.raises(OffbenchError, match=rf"{column} reach .*beyond float32's 3.4e\+38; scale them") as error:
+        offbench.load("large-v0")
+    assert "NaN" not in str(error.value)
+    assert not [warning for warning in recwarn if "overflow" in str(warning.message)]
+
+
+@pytest.mark.parametrize(("bound", "warned"), [(1e5, True), (4.0, False)])
+def test_bounds_far_beyond_the_actions_are_said(
+    bound: float, warned: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    actions = np.linspace(-3, 3, 6, dtype=np.float32).reshape(3, 2)
+    space = gym.spaces.Box(-bound, bound, (2,), np.float32)
+    offbench.load(foreign("wide-v0", [episode(3, 0, True, actions=actions)], actions=space))
+    assert ("correct the action space" in capsys.readouterr().err) == warned
+
+
+def test_bounds_that_are_none_are_refused() -> None:
+    most = np.finfo(np.float32).max
+    space = gym.spaces.Box(-most, most, (2,), np.float32)
+    with pytest.raises(OffbenchError, match="must be bounded"):
+        offbench.load(foreign("huge-v0", [episode(3, 0, True)], actions=space))
