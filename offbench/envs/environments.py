@@ -263,19 +263,28 @@ def _check_spaces(env: gym.Env[Any, Any], where: str) -> None:
 
 def box(space: gym.Space[Any], what: str) -> gym.spaces.Box:
     """Return `space` if it is a flat float Box, else raise an OffbenchError that begins with `what`."""
-    if not isinstance(space, gym.spaces.Box):
-        raise OffbenchError(f"{what} must be a Box space, not {space}; {_flattened(what)}")
-    if not np.issubdtype(space.dtype, np.floating):
+    if isinstance(space, gym.spaces.Box) and not np.issubdtype(space.dtype, np.floating) and len(space.shape) == 1:
         raise OffbenchError(f"{what} must be floats, not {space}; convert them and their space to float32")
-    if len(space.shape) != 1:
-        raise OffbenchError(f"{what} must be a flat Box, not {space}; {_flattened(what)}")
+    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+        kind = "flat Box" if isinstance(space, gym.spaces.Box) else "Box space"
+        raise OffbenchError(f"{what} must be a {kind}, not {space}; {_flattening(space, what)}")
+    if not space.shape[0]:
+        raise OffbenchError(f"{what} have no dimension: {space}")
     return space
 
 
-def _flattened(what: str) -> str:
-    if "observation" in what:
-        return "wrap the environment in FlattenObservation and record it again"
-    return "offbench's algorithms choose continuous actions, one number for each dimension"
+def _flattening(space: gym.Space[Any], what: str) -> str:
+    """Return what makes a flat Box of floats of a space of observations; there is nothing like it for actions."""
+    if "observation" not in what:
+        return "offbench's algorithms choose continuous actions, one number for each dimension"
+    try:
+        flat = gym.spaces.flatten_space(space)
+    except (NotImplementedError, ValueError):
+        flat = space
+    if not isinstance(flat, gym.spaces.Box):
+        return "turn them into numbers and record the dataset again"
+    floats = "" if np.issubdtype(flat.dtype, np.floating) else " and DtypeObservation(env, np.float32)"
+    return f"wrap the environment in FlattenObservation{floats} and record the dataset again"
 
 
 def action_box(space: gym.Space[Any], what: str) -> gym.spaces.Box:
