@@ -212,7 +212,8 @@ def _read_remedy(error: BaseException) -> str | None:
 
 
 def _reason(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    words = " ".join(str(error).split()) or type(error).__name__
+    return f"there is no {words}" if type(error) is KeyError else words
 
 
 def regular(path: str | Path, flags: int = os.O_RDONLY) -> int:

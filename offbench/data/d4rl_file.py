@@ -15,6 +15,7 @@ from minari.serialization import deserialize_space
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.data import minari_store
+from offbench.envs.contact_margin import without_margin
 
 COLUMNS = ("observations", "actions", "rewards", "terminals")
 SEEDS = ("infos/seed", "infos/seeded")  # seeded: where some episodes have a seed of 2**63 or more, and some none
@@ -109,7 +110,7 @@ def _about(path: Path, file: h5py.File) -> dict[str, Any]:
             raise ValueError("a value of another type")
         for key in ("env_spec", "eval_env_spec"):
             if key in known:
-                EnvSpec.from_json(known[key])
+                EnvSpec.from_json(without_margin(known[key])[0])
         kept = tuple(deserialize_space(known[key]) for key in ("observation_space", "action_space") if key in known)
     except Exception as error:  # Gymnasium and Minari raise anything for JSON that is not theirs
         raise OffbenchError(f"{path}: its offbench metadata are damaged ({error}); export the dataset again") from None

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from offbench.common.arrays import Array
-from offbench.common.errors import DamagedError
+from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import damage
 from offbench.data import minari_store
 
@@ -57,7 +57,7 @@ def episodes_of(data: Any, indices: Iterable[int] | None = None) -> Iterator[Rec
         DamagedError, OffbenchError: as `reading` has it.
     """
     wanted = [int(i) for i in (data.episode_indices if indices is None else indices)]
-    with reading(data.spec.dataset_id):
+    with reading(str(data.storage.metadata.get("dataset_id"))):
         known = data.storage.get_episode_metadata(wanted)
         for episode, about in zip(data.iterate_episodes(wanted), known, strict=True):
             # an episode that was reset with options cannot be reset from its seed alone
@@ -119,6 +119,12 @@ def open_parsed(dataset_id: str) -> Any:
         import minari
 
         with reading(dataset_id):
-            data = minari.MinariDataset(minari_store.root() / dataset_id / "data")
+            try:
+                data = minari.MinariDataset(minari_store.root() / dataset_id / "data")
+            except ValueError as error:
+                if "Minari version" not in str(error):
+                    raise
+                words = " ".join(str(error).split())
+                raise OffbenchError(f"cannot read {dataset_id}: {words}; install another version of minari") from error
             int(data.total_steps)  # Minari reads it from the metadata when it is asked for
             return data

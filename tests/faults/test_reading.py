@@ -136,3 +136,33 @@ def test_a_failing_disk_does_not_send_a_run_back_to_an_older_checkpoint(
     assert found is not None
     assert found[1]["step"] == 10
     assert "is damaged" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "cause"),
+    [
+        ({"minari_version": "99.0.0"}, "install another version of minari"),
+        ({"data_format": None}, "is damaged"),
+        ({"total_steps": None}, r"is damaged \(there is no 'total_steps'\)"),
+        ({"total_episodes": 9}, "is damaged"),
+    ],
+    ids=str,
+)
+def test_metadata_of_another_kind_are_one_line(house: str, changes: dict[str, Any], cause: str) -> None:
+    path = minari_store.path_of(house) / "data" / "metadata.json"
+    metadata = json.loads(path.read_text()) | changes
+    path.write_text(json.dumps({key: value for key, value in metadata.items() if value is not None}))
+    for name, attempt in attempts(house).items():
+        if name == "verify" and "damaged" in cause:
+            assert {finding.code for finding in attempt().findings} == {"unreadable"}
+            continue
+        with pytest.raises(OffbenchError, match=cause) as error:
+            attempt()
+        assert isinstance(error.value, DamagedError) == ("damaged" in cause)
+
+
+def test_an_id_in_the_metadata_that_is_none_stops_no_export(house: str) -> None:
+    path = minari_store.path_of(house) / "data" / "metadata.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"dataset_id": "house"}))
+    assert export(house, "out.npz").exists()
+    assert {finding.code for finding in verify(house, workers=1).findings} == {"metadata"}
