@@ -278,7 +278,7 @@ def _flattening(space: gym.Space[Any], what: str) -> str:
     if "observation" not in what:
         return "offbench's algorithms choose continuous actions, one number for each dimension"
     try:
-        flat = gym.spaces.flatten_space(space)
+        flat: gym.Space[Any] = gym.spaces.flatten_space(space)
     except (NotImplementedError, ValueError):
         flat = space
     if not isinstance(flat, gym.spaces.Box):

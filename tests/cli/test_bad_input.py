@@ -137,7 +137,7 @@ CASES: dict[str, tuple[str, str]] = {
     "import-d4rl hopper.hdf5 --id x": ("'x' is not a dataset id", "-v0"),
     "import-d4rl D4RL --id x-v0": ("cannot tell the environment of file.hdf5", "--env hopper"),
     "import-d4rl D4RL --id x-v0 --env hoper": ("did you mean 'hopper'?", ""),
-    "import-d4rl D4RL --id x-v0 --env hopper": ("has observations (4,)", "give the right --env"),
+    "import-d4rl D4RL --id x-v0 --env hopper": ("has 4 observations", "give the right --env"),
     "import-d4rl D4RL --id MEDIUM --env inverted-pendulum": ("tiny-medium-v0 exists already", "--overwrite"),
     "export": ("the following arguments are required: ID, --out", ""),
     "export x-v0 --out out.hdf5": ("unknown dataset 'x-v0'", ""),
@@ -234,7 +234,7 @@ RECIPES: dict[str, tuple[str, str]] = {
         'env_id = "Tank-v0"',
         "doesn't exist. If a module of yours registers it, name it before a colon: my_module:Tank-v0",
     ),
-    "version": ('env_id = "Hopper-v9"', "[ `v2`, `v3`, `v4`, `v5` ]."),
+    "version": ('env_id = "Hopper-v9"', "[ `v2`, `v3`, `v4`, `v5` ]"),
     "discrete env": ('env_id = "CartPole-v1"', "actions must be a Box space, not Discrete(2)"),
     "env argument": ('env_id = "Hopper-v5"\n[env_kwargs]\nlegs = 3', "cannot make the environment"),
 }
@@ -349,7 +349,7 @@ def test_a_share_of_nothing(tiny: tuple[str, str]) -> None:
 def test_a_policy_for_another_environment(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
     settings: dict[str, Any] = {"hidden": (8,), "batch_size": 8, "eval_every": 10, "eval_episodes": 1}
     (folder,) = offbench.train("td3_bc", medium, steps=10, **settings)
-    assert "takes observations (4,)" in refusal(["evaluate", str(folder), "--env", "hopper"], capsys)
+    assert "has observations (4,)" in refusal(["evaluate", str(folder), "--env", "hopper"], capsys)
 
 
 def test_a_changed_recipe_is_another_training(tiny: tuple[str, str], home: Path) -> None:

@@ -19,6 +19,7 @@ import pytest
 import offbench
 from offbench.common import files
 from offbench.data import file_stamps, transitions
+from offbench.data.minari_reader import open_minari
 from offbench.rollouts.policy import uniform
 
 REWARDS = "episode_0/rewards"
@@ -69,7 +70,7 @@ def test_data_in_another_file_are_not_read(
         file["secret"] = rewards  # the right numbers: only where they lie is wrong
     with h5py.File(path, "a") as file:
         lead_away(file, home / "secret")
-    for read in (transitions.load, transitions.open_minari, lambda name: offbench.export(name, "out.npz")):
+    for read in (transitions.load, open_minari, lambda name: offbench.export(name, "out.npz")):
         with pytest.raises(offbench.OffbenchError, match=r"episode_0/rewards is not data of .*main_data\.hdf5"):
             read(recorded)
 

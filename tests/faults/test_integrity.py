@@ -227,7 +227,7 @@ def test_whatever_a_command_raises_is_one_line(
     def fail() -> None:
         raise error
 
-    monkeypatch.setattr("offbench.data.show.inventory_lines", fail)
+    monkeypatch.setattr("offbench.tools.inventory.inventory_lines", fail)
     assert names in refusal(["list"], capsys)
     monkeypatch.setenv("OFFBENCH_TRACEBACK", "1")
     with pytest.raises(SystemExit):
