@@ -40,7 +40,7 @@ class Survey:
 def survey(data: Any, limit: int | None, findings: Findings) -> Survey:
     """Look at every episode of a MinariDataset once; `limit` is the environment's time limit, if it has one."""
     found, piles, twins = Survey(), _Piles(data.action_space), _Twins()
-    with Progress(int(data.total_steps), f"verifying {data.spec.dataset_id}") as progress:
+    with Progress(int(data.total_steps), f"verifying {data.storage.metadata.get('dataset_id')}") as progress:
         for episode in episodes_of(data):
             where = f"episode {episode.index}"
             numeric = all(array.dtype.kind in "fiub" for array in episode.arrays)
