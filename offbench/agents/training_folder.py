@@ -47,7 +47,7 @@ def read_rungs(path: Path) -> list[dict[str, float]]:
     """Read rungs.csv (an empty list if there is none yet). Raises OffbenchError if it is damaged."""
     if not path.exists():
         return []
-    with damage(f"{path} is damaged", "delete its folder to train the agent again"):
+    with damage(str(path), "is damaged", "delete its folder to train the agent again"):
         lines = read_text(path).splitlines()
         header = lines[0].split(",")
         rows = [dict(zip(header, map(float, line.split(",")), strict=True)) for line in lines[1:]]
