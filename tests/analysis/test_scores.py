@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from scipy import stats
 
 import offbench
 from offbench.analysis.normalize import FORMATS, render
 from offbench.cli.main import main
 from offbench.common.scores import interval, mean_std, normalize, run_return
-from offbench.envs.recipes import d4rl_constants
+from offbench.envs.recipes import d4rl_reference
 from offbench.reports.curves import plot_curves
 from offbench.training.run import Run
 
@@ -27,14 +28,20 @@ def test_normalize_by_hand() -> None:
     assert normalize(30.0, 10.0, 50.0) == 50
 
 
-def test_d4rls_constants_are_known_by_family() -> None:
-    for env_id in ("Hopper-v2", "Hopper-v5", "my_module/Hopper-v4"):
-        assert d4rl_constants(env_id) == (-20.272305, 3234.3)
-    assert d4rl_constants("HalfCheetah-v5") == (-280.178953, 12135.0)
-    assert d4rl_constants("Walker2d-v5") == (1.629008, 4592.3)
-    assert d4rl_constants("Ant-v5") == (-325.6, 3879.7)
-    assert d4rl_constants("InvertedPendulum-v5") is None
-    assert d4rl_constants("HopperHard-v0") is None
+def test_d4rls_references_are_those_of_its_infos() -> None:
+    for env_id, reference in {
+        "Hopper-v2": (-20.272305, 3234.3),
+        "Hopper-v4": (-20.272305, 3234.3),
+        "Hopper-v5": (-20.272305, 3234.3),
+        "HalfCheetah-v5": (-280.178953, 12135.0),
+        "Walker2d-v5": (1.629008, 4592.3),
+        "Ant-v5": (-325.6, 3879.7),
+        "InvertedPendulum-v5": None,
+        "HopperHard-v0": None,
+    }.items():
+        name = env_id.partition("-")[0]
+        spec = EnvSpec(env_id, f"gymnasium.envs.mujoco.{name.lower()}:{name}Env", max_episode_steps=1000)
+        assert d4rl_reference(spec.to_json()) == reference
 
 
 def test_the_interval_is_students_t() -> None:

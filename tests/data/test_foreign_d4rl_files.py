@@ -1,4 +1,4 @@
-"""D4RL files that are not as D4RL's newest ones are: no timeouts, mixed precisions, other environments, no transition."""
+"""D4RL files unlike the newest: no timeouts, mixed precisions, other environments, no transition."""
 
 from __future__ import annotations
 
@@ -110,14 +110,14 @@ def test_v0_files_that_begin_in_mid_episode_are_cut_where_episodes_begin(
     env = gym.make("HalfCheetah-v5")
     columns: dict[str, list[Any]] = {name: [] for name in ("observations", "actions", "rewards", "terminals")}
     starts = []
-    for episode in range(4):
-        observation, _ = env.reset(seed=episode)
+    for seed in range(4):
+        observation, _ = env.reset(seed=seed)
         rows = []
         for _ in range(999):
             action = rng.uniform(-1, 1, 6).astype(np.float32)
             rows.append((observation, action, 0.0, False))
             observation = env.step(action)[0]
-        rows = rows[600:] if episode == 0 else rows
+        rows = rows[600:] if seed == 0 else rows
         starts.append(len(columns["rewards"]))
         for row in rows:
             for name, value in zip(columns, row, strict=True):
