@@ -37,6 +37,10 @@ class Config:
         high=1,
         choices=("adaptive",),
         per_run=True,
+        notes={
+            "adaptive": "the adaptive beta starts near 1, where the discriminator alone constrains the policy: early "
+            "scores are low"
+        },
     )
     beta_scope: str = setting("sample", "one adaptive beta per sample or per batch", choices=("sample", "batch"))
     critics: int = setting(2, "M, number of critics", low=2)

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from offbench.analysis.results import REFERENCES, Entry, Results, Task, Trained, read_results, window_words
+from offbench.analysis.results import REFERENCES, Entry, Task, Trained, read_results, window_words
 from offbench.analysis.statistics import Estimate, Paired, improvement, paired
-from offbench.common.errors import OffbenchError, unknown
+from offbench.common.errors import OffbenchError
 from offbench.common.text import counted
-from offbench.training.registry import algorithm_names
-from offbench.training.spec import folder_name
 
 LEVEL = 0.05  # a difference is evidence below this p, if its interval leaves out 0 too
 
@@ -36,7 +34,7 @@ class Comparison:
     Attributes:
         a, b: the groups as selected.
         pairs: what everything else is computed from.
-        reference: what the scores are normalised by, in words.
+        reference: what the scores are normalized by, in words.
         statistics: difference of A - B.
         chance: probability that a run of A scores above one of B, over the paired runs.
         unpaired: how many runs of either have no partner and are left out.
@@ -136,15 +134,15 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
     """Compare two groups of runs over the datasets and seeds that both have.
 
     Args:
-        a, b: ALGO or ALGO/VARIANT, e.g. `td3_bc` and `bdb/beta=0.5`, a variant as a run's folder or a table has
-            it; an algorithm alone is its default variant, or its only one.
+        a, b: the names of two methods as tables have them, e.g. `td3_bc` and `bdb (beta=0.5)`; or ALGO/VARIANT, as
+            folders have it. An algorithm alone is its default variant, or its only one.
         runs: the folder of the run directories.
 
     Raises:
         OffbenchError: no such group, the two are one, or they share no dataset and seed.
     """
     results = read_results(runs)
-    groups = select(results, a), select(results, b)
+    groups = tuple(results.of(results.method(name)) for name in (a, b))
     if groups[0] == groups[1]:
         raise OffbenchError(f"{a} and {b} are the same runs; give two groups")
     both = partners(*groups)
@@ -208,26 +206,3 @@ def _by_dataset(pairs: Iterable[Pair], value: Callable[[Pair], float]) -> dict[s
     for pair in pairs:
         found.setdefault(pair.dataset, []).append(value(pair))
     return found
-
-
-def select(results: Results, selector: str) -> list[Entry]:
-    """Return the entries that ALGO or ALGO/VARIANT names. Raises OffbenchError unless they are of one variant."""
-    algorithm, slash, variant = selector.partition("/")
-    known = [method for method in results.methods if method.algorithm == algorithm]
-    if not known:
-        here = {method.algorithm for method in results.methods}
-        if algorithm in algorithm_names():
-            raise OffbenchError(f"{algorithm} has no evaluated runs here; {', '.join(sorted(here))} have")
-        raise unknown("algorithm", algorithm, here)
-    variants = {method.variant: method for method in known}
-    labels = {method.label.partition(" ")[2]: method.variant for method in known}  # as tables say it: beta=adaptive
-    folders = {folder_name(name): name for name in variants}
-    variant = labels.get(variant, folders.get(variant, variant))
-    if not slash:
-        variant = next(iter(variants)) if len(variants) == 1 else "default"
-        if variant not in variants:
-            names = ", ".join(f"{algorithm}/{name}" for name in variants)
-            raise OffbenchError(f"{algorithm} has several variants: give one of {names}")
-    if variant not in variants:
-        raise unknown(f"variant of {algorithm}", variant, variants)
-    return results.of(variants[variant])

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from offbench.agents.ladder import read_ladder
+from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import Entry, entries_of, read_results
 from offbench.analysis.statistics import iqm
 from offbench.common.errors import OffbenchError
 from offbench.common.scores import normalize
-from offbench.common.tables import markdown
-from offbench.common.text import no_formula
+from offbench.common.tables import latex, markdown
+from offbench.common.text import aligned, compact, no_formula
 from offbench.envs.recipes import load_recipe
 from offbench.training.run import DIGITS, Run, find_runs
 
@@ -30,7 +31,7 @@ def score_runs(runs: str | Path = "runs") -> list[Row]:
     """Return one row for each (dataset, algorithm, variant) below a folder, seeds averaged.
 
     A run's score is the mean of its last 10 evaluations; a row has the mean and the standard deviation over
-    seeds, normalised by the dataset's own reference (`score`) and by D4RL's constants (`d4rl_score`), and the
+    seeds, normalized by the dataset's own reference (`score`) and by D4RL's constants (`d4rl_score`), and the
     interquartile mean of `score` with its 95% bootstrap interval (`iqm`, in JSON and CSV). Only if one id stands for
     several contents, rows have the first digits of the content's hash (`content`). `window` (in JSON and CSV) has the
     steps of the evaluations behind the scores, and is empty if they differ between seeds: only scores of one window
@@ -69,6 +70,7 @@ def _row(entry: Entry, twins: bool) -> Row:
     row: Row = {
         "dataset": entry.task.dataset,
         **({"content": entry.task.content[:DIGITS]} if twins else {}),
+        "method": entry.method.label,
         "algorithm": entry.method.algorithm,
         "variant": entry.method.variant,
         "seeds": len(entry.runs),
@@ -129,13 +131,15 @@ def normalize_runs_or_returns(
             raise OffbenchError("returns need their environment: give --env, e.g. --env hopper 1234.5")
         return score_runs(runs)
     if not returns:
-        raise OffbenchError(f"give the returns to normalise, e.g. --env {env} 1234.5 987")
+        raise OffbenchError(f"give the returns to normalize, e.g. --env {env} 1234.5 987")
     return score_returns(env, returns)
 
 
-TITLES = {
+TITLES: dict[str, str | None] = {
+    "algorithm": None,
+    "variant": None,
     "window": None,
-    "of_steps": None,  # shown as 50,000/1,000,000 in the steps column
+    "of_steps": None,  # shown as 50,000 of 1,000,000 in the steps column
     "score": "score (own ref.)",
     "score_std": None,
     "iqm": None,  # of one dataset's few seeds it is near the mean: for programs, not for the eye
@@ -144,6 +148,12 @@ TITLES = {
     "d4rl_score": "score (D4RL ref.)",
     "d4rl_score_std": None,
 }
+NARROW: dict[str, str | None] = {
+    "score": "score",
+    "d4rl_score": "D4RL score",
+    "evaluations": "evals",
+}  # titles on a terminal
+NAMES = ("dataset", "content", "method", "environment")  # columns of text
 
 
 def render(rows: Sequence[Row], style: str = "table") -> str:
@@ -155,51 +165,92 @@ def render(rows: Sequence[Row], style: str = "table") -> str:
         writer = csv.writer(text, lineterminator="\n")
         writer.writerows([list(rows[0]), *([no_formula(cell) for cell in row.values()] for row in rows)])
         return text.getvalue().rstrip("\n")
-    keys = [key for key in rows[0] if TITLES.get(key, key) is not None]
+    keys = _shown(rows)
     header = [TITLES.get(key, key) or key for key in keys]
-    cells = [[_cell(row, key, "$\\pm$" if style == "latex" else "±") for key in keys] for row in rows]
-    notes = _window_notes(rows)
+    cells = [[_cell(row, key) for key in keys] for row in rows]
     if style == "markdown":
-        return "\n".join([*markdown(header, cells), *(line for note in notes for line in ("", note))])
+        return "\n".join([*markdown(header, cells), *(line for note in notes(rows) for line in ("", f"note: {note}"))])
     if style == "latex":
-        return "\n".join([_latex(header, cells), *(f"% {note}" for note in notes)])
-    widths = [max(len(line[i]) for line in [header, *cells]) for i in range(len(header))]
-    lines = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in [header, *cells]]
-    rule = ["-" * width for width in widths]
-    return "\n".join(["  ".join(line).rstrip() for line in [lines[0], rule, *lines[1:]]] + notes)
+        return "\n".join([_latex(header, cells), *(f"% note: {note}" for note in notes(rows))])
+    lines = aligned(header, cells, sum(key in NAMES for key in keys))
+    return "\n".join([*lines, *(f"note: {note}" for note in notes(rows))])
 
 
-def _window_notes(rows: Sequence[Row]) -> list[str]:
-    """Return a note if scores of one dataset are of evaluations at different steps."""
+def score_table(rows: Sequence[Row], terminal: bool) -> dict[str, Any]:
+    """Return the rows as the arguments of `offbench.common.terminal.print_table`.
+
+    Args:
+        terminal: short titles and numbers, so that the table fits 80 columns; the best score of a dataset is marked.
+    """
+    keys = _shown(rows)
+    titles = TITLES | NARROW if terminal else TITLES
+    cells = [[_cell(row, key, short=terminal) for key in keys] for row in rows]
+    best = _best(rows) if "score" in keys else set()
+    return {
+        "header": [titles.get(key, key) or key for key in keys],
+        "rows": cells,
+        "names": sum(key in NAMES for key in keys),
+        "group": "dataset" in keys,
+        "optional": [titles.get(key) or key for key in ("evaluations", "return", "d4rl_score")],
+        "marked": {(i, keys.index("score")) for i in best},
+    }
+
+
+def _shown(rows: Sequence[Row]) -> list[str]:
+    """Return the columns for a reader: without those that no row has, such as D4RL's score."""
+    keys = [key for key in rows[0] if TITLES.get(key, key) is not None]
+    return [key for key in keys if any(row[key] is not None for row in rows) or key == "score"]
+
+
+def _best(rows: Sequence[Row]) -> set[int]:
+    """Return the places of the rows with the highest score of their dataset, where its scores can be compared."""
+    groups: dict[tuple[Any, Any], list[int]] = {}
+    for i, row in enumerate(rows):
+        groups.setdefault((row.get("dataset"), row.get("content")), []).append(i)
+    best = set()
+    for members in groups.values():
+        windows = {rows[i].get("window") for i in members}
+        scores = {i: f"{rows[i]['score']:.1f}" for i in members if rows[i]["score"] is not None}
+        if len(windows) == 1 and None not in windows and len(scores) > 1:
+            top = f"{max(rows[i]['score'] for i in scores):.1f}"
+            best |= {i for i, score in scores.items() if score == top}
+    return best
+
+
+def notes(rows: Sequence[Row]) -> list[str]:
+    """Return what a reader must know of a score table: which scores do not compare, settings that names leave out."""
     windows: dict[tuple[Any, Any], set[Any]] = {}
     for row in rows:
         if "window" in row:
             windows.setdefault((row["dataset"], row.get("content")), set()).add(row["window"])
-    torn = sorted({dataset for (dataset, _), found in windows.items() if len(found) > 1 or None in found})
-    if not torn:
-        return []
-    return [f"note: scores of {', '.join(torn)} are of evaluations at different steps and cannot be compared"]
+    torn = sorted({dataset for (dataset, _), steps in windows.items() if len(steps) > 1 or None in steps})
+    lines = (
+        [f"scores of {', '.join(torn)} are of evaluations at different steps and cannot be compared"] if torn else []
+    )
+    if any("method" in row for row in rows):
+        methods = dict.fromkeys(Method(row["algorithm"], row["variant"], None, row["method"]) for row in rows)
+        lines += [f"settings of {text}" for text in unnamed_settings(methods)]
+    return lines
 
 
-def _cell(row: Mapping[str, Any], key: str, plus_minus: str) -> str:
+def _cell(row: Mapping[str, Any], key: str, short: bool = False) -> str:
     value = row[key]
     if value is None:
         return "-"
-    if key == "steps" and value != row["of_steps"]:
-        return f"{value:,} of {row['of_steps']:,}"
+    if key == "steps":
+        count = compact if short else "{:,}".format
+        return count(value) if value == row["of_steps"] else f"{count(value)} of {count(row['of_steps'])}"
     if isinstance(value, float):
         std = row.get(f"{key}_std")
         # one seed has no spread: say so rather than print 0
-        spread = "" if f"{key}_std" not in row else f" {plus_minus} " + ("?" if std is None else f"{std:.1f}")
+        spread = "" if f"{key}_std" not in row else " ± " + ("?" if std is None else f"{std:.1f}")
         return f"{value:.1f}{spread}"
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def _latex(header: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
-    def line(parts: Sequence[str]) -> str:
-        return " & ".join(part.replace("_", "\\_") for part in parts) + " \\\\"
-
-    body = [line(header), "\\midrule", *map(line, cells)]
+    body = [" & ".join(map(latex, line)) + r" \\" for line in [header, *cells]]
+    lines = [body[0], r"\midrule", *body[1:]]
     return "\n".join(
-        [f"\\begin{{tabular}}{{{'l' * len(header)}}}", "\\toprule", *body, "\\bottomrule", "\\end{tabular}"]
+        [f"\\begin{{tabular}}{{{'l' * len(header)}}}", r"\toprule", *lines, r"\bottomrule", r"\end{tabular}"]
     )

@@ -1,6 +1,6 @@
 """Results: a folder of runs as tasks, methods and the scores of their seeds.
 
-    Task    a dataset: its id and its content; the reference that its scores are normalised by
+    Task    a dataset: its id and its content; the reference that its scores are normalized by
     Method  an algorithm and a variant
     Entry   the evaluated runs of one method on one task: a cell of the score table
 
@@ -14,23 +14,22 @@ import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase as fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from offbench.common.errors import OffbenchError
+from offbench.analysis.methods import Method, find_method, method_order, name_methods, rank
+from offbench.common.errors import OffbenchError, unknown
 from offbench.common.scores import mean_std, normalize, run_return, window
 from offbench.common.text import counted, printable
 from offbench.data.levels import LEVELS
-from offbench.training.registry import FORMER_SETTINGS
 from offbench.training.run import DIGITS, Run, RunConfig, find_runs
 
 # the order of the BDB paper's Table 1; levels are in its order already
 ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
-METHOD_ORDER = ("td3_bc", "cql", "bdb")
 REFERENCES = {"dataset": "own reference", "d4rl": "D4RL's constants", None: "no reference: raw return"}
-OURS = FORMER_SETTINGS["bdb"].keys()  # settings that make an earlier version's BDB another method than the paper's
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class Task:
 
     Attributes:
         content: its content hash; the same id may have been recorded twice.
-        reference: what scores are normalised by: "dataset", "d4rl" or None (raw returns).
+        reference: what scores are normalized by: "dataset", "d4rl" or None (raw returns).
         twin: whether another content goes by the same id.
     """
 
@@ -59,34 +58,6 @@ class Task:
         stem = re.sub(r"-v\d+$", "", self.dataset)
         found = re.fullmatch(rf"(.+?)[-/]({'|'.join(sorted(LEVELS, key=len, reverse=True))}|\d+percent)", stem)
         return (found[1].split("/")[-1], found[2]) if found else (stem, "")
-
-
-@dataclass(frozen=True)
-class Method:
-    """An algorithm with its settings.
-
-    Attributes:
-        beta: the value of a setting of that name, as the published tables' columns have it.
-    """
-
-    algorithm: str
-    variant: str
-    beta: str | None = None
-
-    @property
-    def label(self) -> str:
-        """What a table's column says, e.g. `bdb beta=0.25`."""
-        variant = "" if self.variant == "default" else self.variant
-        if self.beta is not None and not re.search(r"(^|,)beta=", variant):
-            variant = f"beta={self.beta},{variant}".rstrip(",")
-        return f"{self.algorithm} {variant}".strip()
-
-    @property
-    def published(self) -> str:
-        """The method's name in published/scores.csv; empty for what no paper has."""
-        if {part.partition("=")[0] for part in self.variant.split(",")} & OURS:
-            return ""
-        return self.algorithm if self.beta is None else f"{self.algorithm} beta={self.beta}"
 
 
 @dataclass(frozen=True)
@@ -192,9 +163,9 @@ class Entry:
 
 @dataclass(frozen=True)
 class Results:
-    """All entries of a folder, tasks and methods in the order of the paper's table."""
+    """All entries of one or more folders, tasks and methods in the order of the paper's table."""
 
-    root: Path
+    roots: tuple[Path, ...]
     tasks: tuple[Task, ...]
     methods: tuple[Method, ...]
     entries: Mapping[tuple[Task, Method], Entry]
@@ -209,23 +180,52 @@ class Results:
         runs = [trained for (of, _), entry in self.entries.items() if of == task for trained in entry.runs]
         return len({trained.window for trained in runs}) == 1
 
+    def method(self, name: str) -> Method:
+        """Return the method of a name: as a table has it, ALGO/VARIANT, or ALGO for its default or only variant.
+
+        Raises:
+            OffbenchError: no such method here, or the algorithm has several variants.
+        """
+        return find_method(self.methods, name)
+
     def scores(self, method: Method) -> dict[str, list[float]]:
-        """Return {task: normalised scores of its seeds}; tasks without a reference are left out."""
+        """Return {task: normalized scores of its seeds}; tasks without a reference are left out."""
         return {entry.task.name: entry.scores for entry in self.of(method) if entry.task.reference}
 
 
-def read_results(root: str | Path) -> Results:
-    """Read every run below a folder.
+Folders = str | Path | Sequence[str | Path]
+
+
+def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequence[str] = ()) -> Results:
+    """Read every run below one or more folders.
+
+    Args:
+        datasets: only these, by id or by a pattern such as `hopper-*`; all if empty.
+        methods: only these, by a name as tables have it; all if empty.
 
     Raises:
-        OffbenchError: none is evaluated, or one is there twice. Damaged runs are named on stderr and left out.
+        OffbenchError: none is evaluated, one is there twice, or there is no such dataset or method. Damaged runs are
+            named on stderr and left out.
     """
-    entries, waiting = entries_of(find_runs(Path(root)))
+    roots = tuple(map(Path, [runs] if isinstance(runs, str | Path) else runs))
+    unique = {run.folder.resolve(): run for root in roots for run in find_runs(root)}
+    entries, waiting = entries_of(unique.values())
     if not entries:
-        raise OffbenchError(f"no evaluated runs below {root}; start one with `offbench train ALGO --dataset ID`")
+        below = ", ".join(map(str, roots))
+        raise OffbenchError(f"no evaluated runs below {below}; start one with `offbench train ALGO --dataset ID`")
+    for pattern in datasets:
+        if not any(fnmatch(entry.task.dataset, pattern) for entry in entries):
+            raise unknown("dataset", pattern, {entry.task.dataset for entry in entries})
+    if datasets:
+        entries = [e for e in entries if any(fnmatch(e.task.dataset, pattern) for pattern in datasets)]
+        waiting = [run for run in waiting if any(fnmatch(run.config().dataset, pattern) for pattern in datasets)]
+    if methods:
+        every = tuple(dict.fromkeys(entry.method for entry in entries))
+        wanted = {find_method(every, name) for name in methods}
+        entries, waiting = [entry for entry in entries if entry.method in wanted], []
     tasks = dict.fromkeys(entry.task for entry in entries)
-    methods = sorted({entry.method for entry in entries}, key=_method_order)
-    return Results(Path(root), tuple(tasks), tuple(methods), {(e.task, e.method): e for e in entries}, tuple(waiting))
+    found = sorted({entry.method for entry in entries}, key=method_order)
+    return Results(roots, tuple(tasks), tuple(found), {(e.task, e.method): e for e in entries}, tuple(waiting))
 
 
 def window_words(runs: Iterable[Trained]) -> str:
@@ -264,20 +264,17 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
     for reason in damaged:
         print(f"offbench: warning: left out: {printable(str(reason))}", file=sys.stderr)
     tasks = _tasks(groups)
+    configs: dict[tuple[str, str], list[RunConfig]] = {}
+    for (_, _, algorithm, variant), group in groups.items():
+        configs.setdefault((algorithm, variant), []).extend(trained.config for trained in group)
+    methods = name_methods(configs)
     entries = []
     for (dataset, content, algorithm, variant), group in groups.items():
         group.sort(key=lambda trained: trained.seed)
         _check_seeds(group)
-        method = Method(algorithm, variant, _beta(group[0].config.settings.get("beta")))
-        entries.append(Entry(tasks[dataset, content], method, tuple(group)))
-    entries.sort(key=lambda entry: (_task_order(entry.task), _method_order(entry.method)))
+        entries.append(Entry(tasks[dataset, content], methods[algorithm, variant], tuple(group)))
+    entries.sort(key=lambda entry: (_task_order(entry.task), method_order(entry.method)))
     return entries, waiting
-
-
-def _beta(value: Any) -> str | None:
-    if isinstance(value, int | float) and abs(value) < 1e6:
-        return f"{value:.2f}"
-    return None if value is None else str(value)  # what a damaged config.json or another's algorithm has there
 
 
 def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[Trained]]) -> dict[tuple[str, str], Task]:
@@ -302,15 +299,6 @@ def _check_seeds(runs: Sequence[Trained]) -> None:
             )
 
 
-def _rank(name: str, order: Sequence[str]) -> tuple[int, str]:
-    return (order.index(name) if name in order else len(order), name)
-
-
 def _task_order(task: Task) -> tuple[Any, ...]:
     env, level = task.place
-    return _rank(level, tuple(LEVELS)), _rank(env, ENV_ORDER), task.dataset, task.content
-
-
-def _method_order(method: Method) -> tuple[Any, ...]:
-    # the fixed betas in order, then the words (adaptive)
-    return _rank(method.algorithm, METHOD_ORDER), method.beta or "", len(method.variant), method.variant
+    return rank(level, tuple(LEVELS)), rank(env, ENV_ORDER), task.dataset, task.content

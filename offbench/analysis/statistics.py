@@ -97,7 +97,7 @@ class Paired:
     """The difference of A and B over pairs of runs (same task, same seed).
 
     Attributes:
-        difference: of normalised scores, mean over seeds, then over tasks.
+        difference: of normalized scores, mean over seeds, then over tasks.
         standardised: mean over standard deviation of all pairs' differences; None where they do not vary.
         p: of a sign-flip test, two-sided: how often a difference as large comes about if A and B are alike.
         pairs: how many pairs there are.

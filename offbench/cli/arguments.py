@@ -1,43 +1,127 @@
-"""Types of command-line arguments: what is typed becomes a value, or a refusal that says what was meant."""
+"""The parser of the command line, and the types of its arguments."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from offbench.common.errors import OffbenchError, nearest
+from offbench.common.terminal import is_terminal
+
+HELP_COLUMN = 28  # where the help of an argument begins
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose refusals are one line and exit code 2.
+    """An argument parser whose errors are one line and exit code 2, and whose help is colored on a terminal.
 
     Attributes:
-        asked: the command whose `--help` a refusal names, where it is not the parser's own.
+        asked: the command whose `--help` an error names, where it is not the parser's own.
     """
 
     asked = ""
 
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(formatter_class=_Formatter, **kwargs)
+        self.color = False  # Python 3.14 would color the help, too
+
     def error(self, message: str) -> NoReturn:
-        """Raise the refusal as the error that `main` prints."""
+        """Raise the error that `main` prints."""
         raise OffbenchError(f"{message} (see `{self.asked or self.prog} --help`)")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Refuse what a command does not know here, where its flags are known, and before what it lacks is said."""
+        """Report unknown flags before missing arguments, by the parser that has the flags."""
         if self._subparsers is None:
             for word in args:
                 self._check_flag(word.partition("=")[0])
-        found, rest = super().parse_known_args(args, namespace)
+        parsed, rest = super().parse_known_args(args, namespace)
         if rest:
             self.error(f"unrecognized arguments: {' '.join(rest)}")
-        return found, rest
+        return parsed, rest
 
     def _check_flag(self, flag: str) -> None:
-        known = [name for name in self._option_string_actions if name.startswith("--")]
-        if not flag.startswith("--") or any(name.startswith(flag) for name in known):  # argparse takes abbreviations
+        flags = [name for name in self._option_string_actions if name.startswith("--")]
+        if not flag.startswith("--") or any(name.startswith(flag) for name in flags):  # argparse takes abbreviations
             return
-        near = nearest(flag[2:], [name[2:] for name in known])
+        near = nearest(flag[2:], [name[2:] for name in flags])
         hint = f": did you mean --{near}?" if near else ""
         self.error(f"unrecognized arguments: {flag}{hint}")
+
+    def print_help(self, file: Any = None) -> None:
+        """Print the help, headings and flags in color on a terminal. Without rich: help must come at once."""
+        text, stream = self.format_help(), file or sys.stdout
+        if is_terminal(stream) and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb":
+            text = re.sub(r"(?m)^(\S[^:\n]*:)", "\033[1;32m\\1\033[0m", text)
+            text = re.sub(r"(?m)^(  +)(-[\w-]+(?:, --[\w-]+)?|[a-z][\w-]+(?=  ))", "\\1\033[1;36m\\2\033[0m", text)
+            stream = getattr(stream, "raw_stream", stream)
+        stream.write(text)
+
+
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str, **kwargs: Any) -> None:
+        super().__init__(prog, max_help_position=HELP_COLUMN, **kwargs)
+
+    def _format_args(self, action: argparse.Action, default_metavar: str) -> str:
+        """Return `X ...` for several values, where argparse has `X [X ...]`."""
+        if action.nargs == "+" and action.option_strings:
+            return f"{action.metavar or default_metavar} ..."
+        return super()._format_args(action, default_metavar)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command.
+
+    Attributes:
+        add_arguments: adds its arguments to a parser; takes the words after the command, too.
+        examples: command lines without `offbench`.
+    """
+
+    help: str
+    add_arguments: Callable[[Parser, list[str]], None]
+    examples: Sequence[str]
+
+    def epilog(self) -> str:
+        """Return the examples as the end of the help."""
+        lines = "\n".join(f"  offbench {example}" for example in self.examples)
+        return f"example{'s' if len(self.examples) > 1 else ''}:\n{lines}"
+
+
+def completed(action: argparse.Action, words: Callable[[], Iterable[str]]) -> None:
+    """Let shell completion offer words for an argument, looked up when asked."""
+    action.completer = lambda **_: list(words())  # type: ignore[attr-defined]
+
+
+def local_datasets() -> list[str]:
+    """Return the ids of the local datasets, for completion."""
+    from offbench.data import minari_store
+
+    return minari_store.local_ids()
+
+
+def recipes() -> list[str]:
+    """Return the names of the shipped recipes, for completion."""
+    from offbench.envs.recipes import names
+
+    return names()
+
+
+def levels() -> list[str]:
+    """Return the names of the levels, for completion."""
+    from offbench.data.levels import LEVELS
+
+    return list(LEVELS)
+
+
+def methods() -> list[str]:
+    """Return the names of the methods with runs below ./runs, for completion."""
+    from offbench.analysis.results import read_results
+
+    return [method.label for method in read_results("runs").methods]
 
 
 def trust(parser: Parser) -> None:
@@ -76,7 +160,7 @@ def share(text: str) -> tuple[int, int]:
     """Return (i, n) of `i/n`."""
     first, slash, last = text.partition("/")
     if not slash:
-        raise argparse.ArgumentTypeError(f"{text!r} is no share like 0/4")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a share such as 0/4")
     return natural(first), whole(last)
 
 
@@ -92,9 +176,9 @@ def seed_list(text: str) -> list[int]:
     """Return the seeds of `3`, `0,1,2` or `0:5` (the end is left out, as in Python)."""
     first, colon, last = text.partition(":")
     try:
-        found = list(range(natural(first), natural(last))) if colon else [natural(part) for part in text.split(",")]
+        seeds = list(range(natural(first), natural(last))) if colon else [natural(part) for part in text.split(",")]
     except argparse.ArgumentTypeError as error:
         raise argparse.ArgumentTypeError(f"{error}; seeds are 3, 0,1,2 or 0:4 (0 to 3)") from None
-    if not found:
+    if not seeds:
         raise argparse.ArgumentTypeError(f"{text!r} holds no seed")
-    return found
+    return seeds

@@ -1,24 +1,29 @@
-"""The command line of datasets and of what they are made with. Parse, call, print."""
+"""The commands for datasets. Parse, call, print."""
 
 from __future__ import annotations
 
 import sys
+from json import dumps
 from typing import Any
 
-from offbench.cli.arguments import Parser, natural, trust, whole
+from offbench.cli.arguments import Parser, completed, levels, local_datasets, natural, recipes, trust, whole
+from offbench.common.terminal import hint, print_table, say
 
 
 def collect_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `collect`."""
-    parser.add_argument("env", metavar="ENV", help="a shipped recipe (see `offbench list`) or a recipe file")
-    parser.add_argument("--level", default="medium", help="a level or a fraction such as 0.6 (default: medium)")
-    parser.add_argument("--mix", metavar="LEVEL:SHARE,...", help="a blend, e.g. random:0.5,expert:0.5")
+    _env(parser, "a shipped environment (see `offbench list`) or a recipe file")
+    level = parser.add_argument(
+        "--level", default="medium", help="a level, or a fraction such as 0.6 (default: medium)"
+    )
+    completed(level, levels)
+    parser.add_argument("--mix", metavar="LEVEL:SHARE,...", help="a mix of levels, e.g. random:0.5,expert:0.5")
     parser.add_argument("--steps", type=whole, help="transitions (default: the recipe's, 1,000,000)")
-    parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
-    parser.add_argument("--workers", type=whole, help="recording processes (default: one a core)")
+    parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
+    parser.add_argument("--workers", type=whole, help="recording processes (default: one per core)")
     parser.add_argument("--id", dest="dataset_id", help="the dataset's id (default: <env>-<level>-v0)")
-    parser.add_argument("--overwrite", action="store_true", help="replace a dataset of that id")
-    parser.add_argument("--retrain", action="store_true", help="use an agent trained here, not the shipped one")
+    parser.add_argument("--overwrite", action="store_true", help="replace a dataset with the same id")
+    parser.add_argument("--retrain", action="store_true", help="use an agent trained here instead of the shipped one")
     parser.add_argument("--accept", action="store_true", help="take the nearest policy, however far from the level")
     _behaviour_dir(parser)
 
@@ -26,18 +31,19 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
         from offbench.data.collect import collect
 
         dataset_id = collect(**arguments)
-        print(f"{dataset_id} recorded; next: offbench train bdb --dataset {dataset_id}")
+        print(dataset_id)
+        hint("offbench", "train", "td3_bc", "--dataset", dataset_id)
 
     parser.set_defaults(run=run)
 
 
 def behaviour_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `behaviour`."""
-    parser.add_argument("env", metavar="ENV", help="a shipped recipe or a recipe file")
-    parser.add_argument("--seed", type=natural, default=0, help="of the training (default: 0)")
+    _env(parser, "a shipped environment or a recipe file")
+    parser.add_argument("--seed", type=natural, default=0, help="seed of the training (default: 0)")
     parser.add_argument("--steps", type=whole, help="environment steps (default: the recipe's)")
-    parser.add_argument("--workers", type=whole, help="processes that measure rungs (default: one a core)")
-    parser.add_argument("--out", metavar="DIR", help="where the ladder goes (default: in the training's folder)")
+    parser.add_argument("--workers", type=whole, help="processes that evaluate rungs (default: one per core)")
+    parser.add_argument("--out", metavar="DIR", help="folder of the ladder (default: in the training's folder)")
     _behaviour_dir(parser)
 
     def run(**arguments: Any) -> None:
@@ -48,32 +54,56 @@ def behaviour_arguments(parser: Parser, _: list[str]) -> None:
         ladder = behaviour(**arguments)
         warn_other_references(load_recipe(arguments["env"]), ladder)
         print(f"ladder in {ladder.folder}: random {ladder.random_return:.1f}, expert {ladder.expert_return:.1f}")
-        for rung in ladder.rungs:
-            print(
-                f"  step {rung.step:>9,}  return {rung.ret:>8.1f}  fraction {ladder.fraction(rung):.2f}  {rung.role}"
-            )
+        rows = [
+            [rung.role, f"{rung.step:,}", f"{rung.ret:.1f}", f"{ladder.fraction(rung):.2f}"] for rung in ladder.rungs
+        ]
+        print_table(["rung", "step", "return", "fraction"], rows)
 
     parser.set_defaults(run=run)
 
 
+def _env(parser: Parser, text: str) -> None:
+    completed(parser.add_argument("env", metavar="ENV", help=text), recipes)
+
+
+def _dataset(parser: Parser) -> None:
+    completed(parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset"), local_datasets)
+
+
 def _behaviour_dir(parser: Parser) -> None:
-    parser.add_argument("--behaviour-dir", default="behaviour", metavar="DIR", help="trainings (default: behaviour)")
+    parser.add_argument(
+        "--behaviour-dir", default="behaviour", metavar="DIR", help="folder of trainings (default: behaviour)"
+    )
 
 
 def list_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `list`."""
+    what = ("environments", "levels", "algorithms", "datasets", "runs")
+    parser.add_argument("what", nargs="?", choices=what, metavar="WHAT", help=f"only these: {', '.join(what)}")
+    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the runs (default: runs)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
-    def run() -> None:
-        from offbench.tools.inventory import inventory_lines
+    def run(what: str | None, runs: str, json: bool) -> None:
+        from offbench.tools.inventory import inventory, sections
 
-        print("\n".join(inventory_lines()))
+        contents = inventory(what, runs=runs)
+        if json:
+            print(dumps(contents, indent=1))
+            return
+        for title, header, rows in sections(contents):
+            say(title, "bold")
+            if header:
+                print_table(header, rows, names=2 if title == "runs" else 1)
+            else:
+                print("\n".join(f"  {row[0]}" for row in rows))
+            print()
 
     parser.set_defaults(run=run)
 
 
 def show_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `show`."""
-    parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset")
+    _dataset(parser)
     parser.add_argument("--plot", metavar="PICTURE", help="also draw the histogram of returns (.png, .svg, .pdf)")
 
     def run(dataset_id: str, plot: str | None) -> None:
@@ -83,31 +113,31 @@ def show_arguments(parser: Parser, _: list[str]) -> None:
         picture = summary.plot(plot) if plot else None
         print("\n".join(summary.lines()))
         if picture:
-            print(f"histogram in {picture}", file=sys.stderr)
+            print(f"saved {picture}", file=sys.stderr)
 
     parser.set_defaults(run=run)
 
 
 def card_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `card`."""
-    parser.add_argument("env", metavar="ENV", help="a shipped recipe or a recipe file, its five levels recorded")
-    parser.add_argument("--out", metavar="DIR", help="where the card goes (default: <env>-card)")
+    _env(parser, "a shipped environment or a recipe file, its five levels recorded")
+    parser.add_argument("--out", metavar="DIR", help="folder of the card (default: <env>-card)")
     _behaviour_dir(parser)
 
     def run(**arguments: Any) -> None:
         from offbench.data.card import card
 
-        print(f"card in {card(**arguments)}")
+        print(f"saved {card(**arguments)}")
 
     parser.set_defaults(run=run)
 
 
 def verify_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `verify`."""
-    parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset, anybody's")
-    parser.add_argument("--episodes", type=natural, help="to play again (default: 300; 0: none)")
-    parser.add_argument("--workers", type=whole, help="processes (default: one a core)")
-    parser.add_argument("--json", action="store_true", dest="as_json", help="print the report as JSON")
+    _dataset(parser)
+    parser.add_argument("--episodes", type=natural, help="episodes to replay in the simulator (default: 300; 0: none)")
+    parser.add_argument("--workers", type=whole, help="processes (default: one per core)")
+    parser.add_argument("--json", action="store_true", dest="as_json", help="print JSON")
     trust(parser)
 
     def run(as_json: bool, **arguments: Any) -> None:
@@ -123,31 +153,36 @@ def verify_arguments(parser: Parser, _: list[str]) -> None:
 
 def import_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `import-d4rl`."""
-    parser.add_argument("file", metavar="FILE.hdf5", help="a D4RL file, or one that `offbench export` wrote")
+    parser.add_argument("file", metavar="FILE.hdf5", help="a D4RL file, or a file that `offbench export` wrote")
     parser.add_argument("--id", dest="dataset_id", required=True, help="the Minari id, e.g. d4rl-hopper-medium-v2")
-    parser.add_argument("--env", metavar="RECIPE", help="the environment to evaluate in (default: by the file's name)")
-    parser.add_argument("--overwrite", action="store_true", help="replace a dataset of that id")
+    env = parser.add_argument(
+        "--env", metavar="RECIPE", help="environment for evaluation (default: guessed from the file's name)"
+    )
+    completed(env, recipes)
+    parser.add_argument("--overwrite", action="store_true", help="replace a dataset with the same id")
 
     def run(**arguments: Any) -> None:
         from offbench.data.import_d4rl import import_d4rl
 
-        print(f"{import_d4rl(**arguments)} imported; next: offbench show {arguments['dataset_id']}")
+        dataset_id = import_d4rl(**arguments)
+        print(dataset_id)
+        hint("offbench", "show", dataset_id)
 
     parser.set_defaults(run=run)
 
 
 def export_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `export`."""
-    parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset")
+    _dataset(parser)
     parser.add_argument("--out", required=True, metavar="FILE", help="the file to write: .hdf5 (D4RL) or .npz")
-    parser.add_argument("--format", choices=("d4rl", "npz"), dest="style", help="default: as the file ends")
+    parser.add_argument("--format", choices=("d4rl", "npz"), dest="style", help="default: by the file's ending")
     parser.add_argument(
-        "--drop-timeouts", action="store_true", help="npz: without the steps that D4RL's qlearning_dataset drops"
+        "--drop-timeouts", action="store_true", help="npz: leave out the steps that D4RL's qlearning_dataset drops"
     )
 
     def run(**arguments: Any) -> None:
         from offbench.data.export import export
 
-        print(f"written to {export(**arguments)}")
+        print(f"saved {export(**arguments)}")
 
     parser.set_defaults(run=run)

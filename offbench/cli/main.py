@@ -10,77 +10,127 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
 from offbench.cli import data, results, tools, training
-from offbench.cli.arguments import Parser
+from offbench.cli.arguments import Command, Parser
 from offbench.common.errors import unknown
+from offbench.common.terminal import labelled
 from offbench.common.text import printable
 from offbench.training.registry import failure
 
-
-def completion_arguments(parser: Parser, _: list[str]) -> None:
-    """Add the arguments of `completion`."""
-    from offbench.cli.completion import SHELLS, script
-
-    parser.add_argument("shell", choices=SHELLS)
-
-    def run(shell: str) -> None:
-        def fill(words: list[str]) -> Parser:
-            sub = Parser(prog="offbench")
-            COMMANDS[words[0]][1](sub, words[1:])
-            return sub
-
-        print(script(shell, {command: help_ for command, (help_, _) in COMMANDS.items()}, fill))
-
-    parser.set_defaults(run=run)
-
-
-# What each does, and what adds its arguments.
-COMMANDS: dict[str, tuple[str, Callable[[Parser, list[str]], None]]] = {
-    "collect": (
-        "record a dataset: random, medium, medium-replay, medium-expert, expert, or a fraction",
-        data.collect_arguments,
-    ),
-    "train": ("train an algorithm on a dataset, with evaluations as it goes", training.train_arguments),
-    "benchmark": ("a whole grid: datasets x algorithms x settings x seeds, resumable", training.benchmark_arguments),
-    "normalize": ("the score table of all runs, or the scores of given returns", results.normalize_arguments),
-    "report": ("all runs as one page, with tables and figures as files", results.report_arguments),
-    "compare": ("two methods over the datasets and seeds that both have, with a verdict", results.compare_arguments),
-    "evaluate": ("play a run's policy, or a policy file", results.evaluate_arguments),
-    "behaviour": ("train an environment's behaviour agent (SAC) and build its ladder", data.behaviour_arguments),
-    "list": ("environments, levels, algorithms and local datasets", data.list_arguments),
-    "show": ("what is in a dataset", data.show_arguments),
-    "verify": (
-        "check a dataset: its arrays, its metadata, and a sample of episodes played again",
-        data.verify_arguments,
-    ),
-    "import-d4rl": ("turn a D4RL file (v0, v1, v2) into a Minari dataset", data.import_arguments),
-    "export": ("write a dataset as a D4RL file, or as arrays (npz)", data.export_arguments),
-    "export-policy": ("write a run's policy as TorchScript", tools.export_policy_arguments),
-    "card": ("write an environment's dataset card from its five recorded levels", data.card_arguments),
-    "video": ("film a run's policy, a policy file, or a level such as hopper:medium", tools.video_arguments),
-    "doctor": (
-        "what a bug report needs: versions, physics, machine, paths; exit code 1 if something is broken",
-        tools.doctor_arguments,
-    ),
-    "completion": ("print a shell's completion of these commands", completion_arguments),
+COMMANDS: dict[str, dict[str, Command]] = {
+    "Data": {
+        "collect": Command(
+            "record a dataset of a level: random, medium, expert, ...",
+            data.collect_arguments,
+            ["collect hopper --level medium", "collect hopper --mix random:0.5,expert:0.5 --steps 100000"],
+        ),
+        "list": Command(
+            "list environments, levels, algorithms, local datasets and runs",
+            data.list_arguments,
+            ["list", "list runs", "list datasets --json"],
+        ),
+        "show": Command("show what is in a dataset", data.show_arguments, ["show hopper-medium-v0"]),
+        "verify": Command(
+            "check a dataset's arrays and metadata, and replay episodes",
+            data.verify_arguments,
+            ["verify hopper-medium-v0"],
+        ),
+        "import-d4rl": Command(
+            "convert a D4RL file (v0, v1, v2) to a Minari dataset",
+            data.import_arguments,
+            ["import-d4rl hopper_medium-v2.hdf5 --id d4rl-hopper-medium-v2"],
+        ),
+        "export": Command(
+            "write a dataset as a D4RL file or as arrays (.npz)",
+            data.export_arguments,
+            ["export hopper-medium-v0 --out hopper-medium.hdf5"],
+        ),
+        "card": Command("write the dataset card of an environment", data.card_arguments, ["card hopper"]),
+        "behaviour": Command(
+            "train a behaviour agent (SAC) and build its ladder of policies",
+            data.behaviour_arguments,
+            ["behaviour hopper --steps 300000"],
+        ),
+    },
+    "Train": {
+        "train": Command(
+            "train an algorithm on a dataset and evaluate it",
+            training.train_arguments,
+            [
+                "train td3_bc --dataset hopper-medium-v0",
+                "train bdb --dataset hopper-medium-v0 --seeds 0:5 --beta 0.5 adaptive",
+            ],
+        ),
+        "benchmark": Command(
+            "train a grid: datasets x algorithms x settings x seeds",
+            training.benchmark_arguments,
+            ["benchmark smoke", "benchmark paper-small --plan"],
+        ),
+    },
+    "Results": {
+        "normalize": Command(
+            "print the score table of all runs, or score given returns",
+            results.normalize_arguments,
+            ["normalize", "normalize --env hopper 1234.5 987"],
+        ),
+        "report": Command(
+            "write all runs as a page with tables and figures",
+            results.report_arguments,
+            ["report", "report --datasets 'hopper-*' --methods td3_bc 'bdb (adaptive)' --title Hopper"],
+        ),
+        "compare": Command(
+            "compare two methods over the datasets and seeds of both",
+            results.compare_arguments,
+            ["compare td3_bc 'bdb (adaptive)'"],
+        ),
+        "evaluate": Command(
+            "run episodes with a run's policy or a policy file",
+            results.evaluate_arguments,
+            ["evaluate runs/hopper-medium-v0/td3_bc/default/seed-0 --episodes 100"],
+        ),
+        "video": Command(
+            "film a run's policy, a policy file, or a level",
+            results.video_arguments,
+            ["video hopper:medium --out hopper.gif"],
+        ),
+        "export-policy": Command(
+            "write a policy for use without offbench",
+            results.export_policy_arguments,
+            ["export-policy runs/hopper-medium-v0/td3_bc/default/seed-0 --out policy.pt"],
+        ),
+    },
+    "Tools": {
+        "doctor": Command(
+            "check this machine; exit code 1 if something is broken", tools.doctor_arguments, ["doctor"]
+        ),
+        "completion": Command(
+            "print the script for shell completion",
+            tools.completion_arguments,
+            ["completion bash > ~/.local/share/bash-completion/completions/offbench"],
+        ),
+    },
 }
+BY_NAME = {name: command for group in COMMANDS.values() for name, command in group.items()}
 
 
-RESUMED = ("collect", "train", "benchmark", "behaviour")  # that keep checkpoints
+RESUMED = ("collect", "train", "benchmark", "behaviour")  # commands that keep checkpoints
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run one command.
 
-    Exits with 0, 1 if `verify` or `doctor` found something, 2 for a problem the user can mend, 130 after Ctrl-C, 143
-    after SIGTERM.
+    Exits with 0, 1 if `verify` or `doctor` found a problem, 2 for an error that the user can fix, 130 after Ctrl-C,
+    143 after SIGTERM.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions
+        _complete()
     try:
         with _terminable(), _printable_output():
             _run(words)
     except KeyboardInterrupt as stop:
-        goes_on = "; the same command goes on from the last checkpoint, or begins again if there is none yet"
-        print(f"\noffbench: stopped{goes_on if _command(words) in RESUMED else ''}", file=sys.stderr)
+        resume = "; rerun the same command to resume from the last checkpoint, if there is one"
+        print(file=sys.stderr)
+        labelled("offbench", f"stopped{resume if _command(words) in RESUMED else ''}", "bold yellow")
         sys.exit(143 if isinstance(stop, Terminated) else 130)
     except BrokenPipeError:  # the reader of a pipe (`| head`) has left
         _discard_output()
@@ -88,22 +138,26 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(0)
     except Exception as error:
         _discard_output()
-        print(f"offbench: {printable(' '.join(failure(error).split()))}", file=sys.stderr)
+        labelled("offbench", printable(" ".join(failure(error).split())), "bold red")
         sys.exit(2)
 
 
 class _Printable:
-    """A text stream that shows text of files as it is, and never obeys it or chokes on it."""
+    """A text stream that spells out control characters of files instead of obeying them.
+
+    Attributes:
+        raw_stream: the stream itself, for text with colors of our own.
+    """
 
     def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+        self.raw_stream = stream
 
     def write(self, text: str) -> int:
-        encoding = self._stream.encoding or "utf-8"
-        return self._stream.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
+        encoding = self.raw_stream.encoding or "utf-8"
+        return self.raw_stream.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
+        return getattr(self.raw_stream, name)
 
 
 @contextlib.contextmanager
@@ -150,17 +204,41 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _run(words: list[str]) -> None:
-    parser = Parser(prog="offbench", description="Offline-RL datasets and benchmarks.")
-    parser.add_argument("--version", action="version", version=_version())
+class _MainParser(Parser):
+    """The parser of `offbench` itself: its help shows the commands in groups."""
+
+    def format_help(self) -> str:
+        """Return usage, commands and a way to begin."""
+        lines = ["usage: offbench COMMAND ...", "", f"{self.description}"]
+        for title, group in COMMANDS.items():
+            lines += ["", f"{title}:", *(f"  {name:<15}{command.help}" for name, command in group.items())]
+        lines += ["", "Quickstart:"]
+        first = ("collect", "train", "normalize", "report")
+        lines += [f"  offbench {BY_NAME[name].examples[0]}" for name in first]
+        lines += ["", "`offbench COMMAND --help` shows the options of a command, with examples."]
+        return "\n".join(lines) + "\n"
+
+
+def _parser(words: list[str]) -> Parser:
+    """Return the parser for a command line; only the command that runs gets its arguments, which take time to load."""
+    parser = _MainParser(prog="offbench", description="Record offline-RL datasets and benchmark algorithms on them.")
+    version = _version() if any(word.startswith("--v") for word in words) else ""  # it takes a while to read
+    parser.add_argument("--version", action="version", version=version)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
     name = _command(words)
-    if name is not None and name not in COMMANDS:
-        raise unknown("command", name, COMMANDS)
-    for command, (help_, add_arguments) in COMMANDS.items():
-        sub = commands.add_parser(command, help=help_, description=help_[0].upper() + help_[1:] + ".")
-        if command == name:  # only the command that runs pays for its arguments
-            add_arguments(sub, words[words.index(name) + 1 :])
+    for each, command in BY_NAME.items():
+        description = command.help[0].upper() + command.help[1:].removesuffix(", ...") + "."
+        sub = commands.add_parser(each, help=command.help, description=description, epilog=command.epilog())
+        if each == name:
+            command.add_arguments(sub, words[words.index(name) + 1 :])
+    return parser
+
+
+def _run(words: list[str]) -> None:
+    name = _command(words)
+    if name is not None and name not in BY_NAME:
+        raise unknown("command", name, BY_NAME)
+    parser = _parser(words)
     arguments = vars(parser.parse_args(words))
     if arguments.pop("command") is None:
         parser.print_help()
@@ -171,6 +249,17 @@ def _run(words: list[str]) -> None:
 
         run = trusting()(run)
     run(**arguments)
+
+
+def _complete() -> NoReturn:
+    """Answer a shell that asks for completions."""
+    from argcomplete import autocomplete
+    from argcomplete.lexers import split_line
+
+    line, point = os.environ["COMP_LINE"], int(os.environ["COMP_POINT"])
+    _, _, _, words, _ = split_line(line, point)
+    autocomplete(_parser(words[1:]))
+    sys.exit(0)
 
 
 def _command(words: list[str]) -> str | None:

@@ -1,4 +1,4 @@
-"""The command line of what comes out of runs: scores, report, comparison, evaluation. Parse, call, print."""
+"""The commands for results: scores, report, comparison, policies. Parse, call, print."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import sys
 from json import dumps
 from typing import Any
 
-from offbench.cli.arguments import Parser, natural, number, trust, whole
+from offbench.cli.arguments import Parser, completed, local_datasets, methods, natural, number, recipes, trust, whole
+from offbench.common.terminal import is_terminal, note, print_table, say
+
+RUNS_HELP = "folder of the runs (default: runs)"
 
 
 def normalize_arguments(parser: Parser, _: list[str]) -> None:
@@ -14,54 +17,76 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
     from offbench.analysis.normalize import FORMATS
 
     parser.add_argument("returns", nargs="*", type=number, metavar="RETURN", help="returns to score, with --env")
-    parser.add_argument("--env", help="the environment of the returns: a recipe")
-    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+    completed(parser.add_argument("--env", help="environment of the returns"), recipes)
+    parser.add_argument("--runs", default="runs", metavar="DIR", help=RUNS_HELP)
     parser.add_argument("--format", choices=FORMATS, default="table", dest="style", help="default: table")
     parser.add_argument("--plot", metavar="PICTURE", help="also draw the learning curves (.png, .svg, .pdf)")
 
     def run(style: str, plot: str | None, **arguments: Any) -> None:
-        from offbench.analysis.normalize import count_waiting, normalize_runs_or_returns, render
+        from offbench.analysis.normalize import count_waiting, normalize_runs_or_returns
         from offbench.common.text import counted
 
         rows = normalize_runs_or_returns(**arguments)
-        print(render(rows, style))
+        print_scores(rows, style)
         waiting = 0 if arguments["env"] else count_waiting(arguments["runs"])
         if waiting:
-            verb = "has" if waiting == 1 else "have"
-            print(f"{counted(waiting, 'run')} {verb} no evaluation yet", file=sys.stderr)
+            note(f"{counted(waiting, 'run')} without an evaluation yet")
         if plot:
             from offbench.reports.curves import plot_curves
 
-            print(f"curves in {plot_curves(arguments['runs'], plot)}", file=sys.stderr)
+            print(f"saved {plot_curves(arguments['runs'], plot)}", file=sys.stderr)
 
     parser.set_defaults(run=run)
 
 
+def print_scores(rows: list[dict[str, Any]], style: str = "table") -> None:
+    """Print the rows of `normalize`."""
+    from offbench.analysis.normalize import notes, render, score_table
+
+    if style != "table":
+        print(render(rows, style))
+        return
+    print_table(**score_table(rows, is_terminal(sys.stdout)))
+    for line in notes(rows):
+        say(f"note: {line}", "dim")
+
+
 def report_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `report`."""
-    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
-    parser.add_argument("--out", default="report", metavar="DIR", help="where the report goes (default: report)")
+    parser.add_argument(
+        "--runs", nargs="+", default=["runs"], metavar="DIR", help="folders of runs, shown together (default: runs)"
+    )
+    parser.add_argument("--out", default="report", metavar="DIR", help="folder of the report (default: report)")
+    parser.add_argument("--title", help="title of the page (default: Offline RL benchmark)")
+    datasets = parser.add_argument(
+        "--datasets", nargs="+", metavar="ID", help="only these datasets; patterns such as 'hopper-*' are understood"
+    )
+    completed(datasets, local_datasets)
+    only = parser.add_argument("--methods", nargs="+", metavar="NAME", help="only these methods, as tables name them")
+    completed(only, methods)
 
     def run(**arguments: Any) -> None:
         from offbench.reports.report import report
 
-        print(f"report in {report(**arguments)}")
+        print(f"saved {report(**arguments)}")
 
     parser.set_defaults(run=run)
 
 
 def compare_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `compare`."""
-    parser.add_argument("a", metavar="A", help="a group of runs: ALGO or ALGO/VARIANT, e.g. td3_bc")
-    parser.add_argument("b", metavar="B", help="the other one, e.g. bdb/beta=0.5")
-    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+    completed(parser.add_argument("a", metavar="A", help="a method as tables name it, e.g. td3_bc"), methods)
+    completed(
+        parser.add_argument("b", metavar="B", help="the other one, e.g. 'bdb (beta=0.5)' or bdb/beta=0.5"), methods
+    )
+    parser.add_argument("--runs", default="runs", metavar="DIR", help=RUNS_HELP)
     parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(json: bool, **arguments: Any) -> None:
         from offbench.analysis.compare import compare
 
-        found = compare(**arguments)
-        print(dumps(found.row(), indent=1) if json else "\n".join(found.lines()))
+        comparison = compare(**arguments)
+        print(dumps(comparison.row(), indent=1) if json else "\n".join(comparison.lines()))
 
     parser.set_defaults(run=run)
 
@@ -69,23 +94,27 @@ def compare_arguments(parser: Parser, _: list[str]) -> None:
 def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `evaluate`."""
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_POLICY", help="run directories or policy files")
-    parser.add_argument("--env", help="a recipe, instead of the environment the policy names")
+    completed(parser.add_argument("--env", help="environment, instead of the policy's own"), recipes)
     parser.add_argument("--episodes", type=whole, default=10, help="default: 10")
-    parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
+    parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mode")
-    parser.add_argument("--similarity", action="store_true", help="a run's similar score on its dataset, no episodes")
-    parser.add_argument("--tolerance", type=number, default=0.05, help="of the similar score, share of |Q|")
-    parser.add_argument("--action-tolerance", type=number, default=0.1, help="of its second reading")
-    parser.add_argument("--workers", type=whole, help="processes (default: one a core)")
+    parser.add_argument(
+        "--similarity", action="store_true", help="a run's similar score on its dataset instead of episodes"
+    )
+    parser.add_argument("--tolerance", type=number, default=0.05, help="similar score: share of |Q| (default: 0.05)")
+    parser.add_argument(
+        "--action-tolerance", type=number, default=0.1, help="similar score by action: distance (default: 0.1)"
+    )
+    parser.add_argument("--workers", type=whole, help="processes (default: one per core)")
     trust(parser)
 
     def similar(path: str, tolerance: float, action_tolerance: float, seed: int) -> None:
         from offbench.evaluation.evaluate import similarity
 
-        found = similarity(path, tolerance=tolerance, action_tolerance=action_tolerance, seed=seed)
-        print(f"{path}: similar score at step {found['step']:,} over {found['samples']:,} transitions")
-        print(f"by Q       {found['q_similar']:.2f}%  (within {100 * tolerance:g}% of |Q1(s, a)|)")
-        print(f"by action  {found['action_similar']:.2f}%  (root mean square distance at most {action_tolerance:g})")
+        result = similarity(path, tolerance=tolerance, action_tolerance=action_tolerance, seed=seed)
+        print(f"{path}: similar score at step {result['step']:,} over {result['samples']:,} transitions")
+        print(f"by Q       {result['q_similar']:.2f}%  (within {100 * tolerance:g}% of |Q1(s, a)|)")
+        print(f"by action  {result['action_similar']:.2f}%  (root mean square distance at most {action_tolerance:g})")
 
     def run(paths: list[str], similarity: bool, tolerance: float, action_tolerance: float, **arguments: Any) -> None:
         from offbench.evaluation.evaluate import evaluate
@@ -95,5 +124,38 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
                 similar(path, tolerance, action_tolerance, arguments["seed"])
             else:
                 print("\n".join(([path] if len(paths) > 1 else []) + evaluate(path, **arguments).lines()))
+
+    parser.set_defaults(run=run)
+
+
+def video_arguments(parser: Parser, _: list[str]) -> None:
+    """Add the arguments of `video`."""
+    parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run, a policy file, or ENV:LEVEL (hopper:medium)")
+    parser.add_argument("--out", default="video.gif", metavar="FILE", help=".gif or .mp4 (default: video.gif)")
+    completed(parser.add_argument("--env", help="environment, instead of the policy's own"), recipes)
+    parser.add_argument("--episodes", type=whole, default=1, help="default: 1")
+    parser.add_argument("--seconds", type=number, help="longest duration (default: whole episodes)")
+    parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
+    parser.add_argument("--fps", type=whole, default=25, help="frames per second (default: 25)")
+    parser.add_argument("--size", type=whole, default=480, help="longer side in pixels (default: 480)")
+    trust(parser)
+
+    def run(**arguments: Any) -> None:
+        from offbench.evaluation.video import video
+
+        print(f"saved {video(**arguments)}")
+
+    parser.set_defaults(run=run)
+
+
+def export_policy_arguments(parser: Parser, _: list[str]) -> None:
+    """Add the arguments of `export-policy`."""
+    parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run directory or a policy file")
+    parser.add_argument("--out", required=True, metavar="FILE", help="the file to write: .pt (TorchScript)")
+
+    def run(**arguments: Any) -> None:
+        from offbench.evaluation.export_policy import export_policy
+
+        print(f"saved {export_policy(**arguments)}")
 
     parser.set_defaults(run=run)

@@ -1,32 +1,14 @@
-"""The commands that help with a machine: `video`, `doctor` and `completion`. Parse, call, print."""
+"""The commands for this machine: `doctor` and `completion`. Parse, call, print."""
 
 from __future__ import annotations
 
 import sys
 from json import dumps
-from typing import Any
 
-from offbench.cli.arguments import Parser, natural, number, trust, whole
+from offbench.cli.arguments import Parser
+from offbench.common.terminal import print_table
 
-
-def video_arguments(parser: Parser, _: list[str]) -> None:
-    """Add the arguments of `video`."""
-    parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run, a policy file, or ENV:LEVEL (hopper:medium)")
-    parser.add_argument("--out", default="video.gif", metavar="FILE", help=".gif or .mp4 (default: video.gif)")
-    parser.add_argument("--env", help="a recipe, instead of the environment the policy names")
-    parser.add_argument("--episodes", type=whole, default=1, help="default: 1")
-    parser.add_argument("--seconds", type=number, help="length of the film at most (default: whole episodes)")
-    parser.add_argument("--seed", type=natural, default=0, help="of the episodes (default: 0)")
-    parser.add_argument("--fps", type=whole, default=25, help="frames a second (default: 25)")
-    parser.add_argument("--size", type=whole, default=480, help="longer side in pixels (default: 480)")
-    trust(parser)
-
-    def run(**arguments: Any) -> None:
-        from offbench.evaluation.video import video
-
-        print(f"film in {video(**arguments)}")
-
-    parser.set_defaults(run=run)
+SHELLS = ("bash", "zsh", "fish")
 
 
 def doctor_arguments(parser: Parser, _: list[str]) -> None:
@@ -34,23 +16,27 @@ def doctor_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(json: bool) -> None:
-        from offbench.tools.doctor import BROKEN, as_json, doctor
+        from offbench.tools.doctor import BROKEN, OK, as_json, doctor
 
-        found = doctor()
-        print(dumps(as_json(found), indent=1) if json else "\n".join(map(str, found)))
-        sys.exit(any(finding.state == BROKEN for finding in found))
+        findings = doctor()
+        if json:
+            print(dumps(as_json(findings), indent=1))
+        else:
+            rows = [[finding.name, finding.state, finding.text] for finding in findings]
+            not_ok = {(i, 1) for i, finding in enumerate(findings) if finding.state != OK}
+            print_table(["check", "state", "details"], rows, names=3, marked=not_ok)
+        sys.exit(any(finding.state == BROKEN for finding in findings))
 
     parser.set_defaults(run=run)
 
 
-def export_policy_arguments(parser: Parser, _: list[str]) -> None:
-    """Add the arguments of `export-policy`."""
-    parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run directory or a policy file")
-    parser.add_argument("--out", required=True, metavar="FILE.pt", help="the file to write")
+def completion_arguments(parser: Parser, _: list[str]) -> None:
+    """Add the arguments of `completion`."""
+    parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help=", ".join(SHELLS))
 
-    def run(**arguments: Any) -> None:
-        from offbench.evaluation.export_policy import export_policy
+    def run(shell: str) -> None:
+        from argcomplete.shell_integration import shellcode
 
-        print(f"written to {export_policy(**arguments)}")
+        print(shellcode(["offbench"], shell=shell))
 
     parser.set_defaults(run=run)

@@ -1,55 +1,48 @@
-"""The command line of training: `train` and `benchmark`. Parse, call, print."""
+"""The commands that train: `train` and `benchmark`. Parse, call, print."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import shlex
-import sys
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from offbench.cli.arguments import Parser, auto, seed_list, share, trust, whole
+from offbench.cli.arguments import Parser, auto, completed, local_datasets, seed_list, share, trust, whole
+from offbench.cli.results import print_scores
+from offbench.common.terminal import hint, note
+
+OPTIMIZATION = ("batch_size", "discount", "tau", "policy_freq", "normalize")  # settings that every method has
 
 SWITCHES = ("--tensorboard", "--trust")  # flags of `train` without a value: the algorithm may follow them
 
 
 def train_arguments(parser: Parser, words: list[str]) -> None:
     """Add the arguments of `train`."""
-    from offbench.common.settings import fields
-    from offbench.training.registry import algorithm_names, load_algorithm
+    from offbench.training.registry import algorithm_names
 
-    parser.add_argument("algorithm", metavar="ALGO", help=f"one of {', '.join(algorithm_names())}")
-    parser.add_argument("--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets")
+    parser.usage = "offbench train ALGO --dataset ID ... [options]"
+    algorithm, named = _algorithm(words)
+    argument = parser.add_argument("algorithm", metavar="ALGO", help=f"one of {', '.join(algorithm_names())}")
+    completed(argument, algorithm_names)
+    dataset = parser.add_argument("--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets")
+    completed(dataset, local_datasets)
     parser.add_argument(
-        "--seeds",
-        type=seed_list,
-        default=[0],
-        metavar="LIST",
-        help="which: 0,1,2 or 0:5 (0 to 4); 3 is the seed 3, where a grid's `seeds = 3` is three (default: 0)",
+        "--seeds", type=seed_list, default=[0], metavar="LIST", help="seeds: 3, 0,1,2 or 0:5 (0 to 4) (default: 0)"
     )
     parser.add_argument("--steps", type=whole, default=1_000_000, help="updates (default: 1,000,000)")
     parser.add_argument("--eval-every", type=whole, default=5_000, help="updates between evaluations (default: 5,000)")
-    parser.add_argument("--eval-episodes", type=whole, default=10, help="episodes of an evaluation (default: 10)")
+    parser.add_argument("--eval-episodes", type=whole, default=10, help="episodes per evaluation (default: 10)")
     _machine(parser)
-    parser.add_argument("--tensorboard", action="store_true", help="write event files beside each run")
-    parser.add_argument("--wandb", metavar="PROJECT", help="show the runs in a Weights & Biases project")
-    algorithm = _algorithm(words)
+    parser.add_argument("--tensorboard", action="store_true", help="write event files into each run's folder")
+    parser.add_argument("--wandb", metavar="PROJECT", help="log to a Weights & Biases project")
     if algorithm is None:
-        parser.epilog = "`offbench train ALGO --help` shows the algorithm's own settings."
+        parser.epilog = f"`offbench train ALGO --help` shows an algorithm's own settings.\n\n{parser.epilog}"
         parser.set_defaults(run=lambda **_: parser.error("name the algorithm first: offbench train ALGO --dataset ID"))
         return
-    known = fields(load_algorithm(algorithm).Config)
     parser.asked = f"offbench train {algorithm}"
-    group = parser.add_argument_group(f"settings of {algorithm}")
-    for name, field in known.items():
-        group.add_argument(
-            f"--{name.replace('_', '-')}",
-            dest=f"setting_{name}",
-            nargs="+",
-            metavar="N,N" if isinstance(field.default, tuple) else "X",
-            default=argparse.SUPPRESS,
-            help=_help(field).replace("%", "%%"),
-        )
+    config = _settings(parser, algorithm)
 
     def run(**arguments: Any) -> None:
         from offbench.training.run import Run
@@ -57,37 +50,95 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
 
         settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
         rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
+        rest["algorithm"], settings = algorithm, named | settings
         folders = train(**rest, **settings, command=shlex.join(["offbench", "train", *words]))
         for folder in folders:
             print(folder)
+        for text in _notices(config, settings):
+            note(text)
         if any(Run(folder).evaluations() for folder in folders):
-            print(f"next: {shlex.join(['offbench', 'normalize', '--runs', rest['runs']])}")
+            hint("offbench", "normalize", *([] if rest["runs"] == "runs" else ["--runs", rest["runs"]]))
         else:
-            evaluate = shlex.join(["offbench", "evaluate", str(folders[0])])
-            print(f"next: {evaluate} --env RECIPE, with a recipe of the environment that the dataset is of")
+            note("the dataset names no environment to evaluate in: evaluate the runs with --env RECIPE")
+            hint("offbench", "evaluate", str(folders[0]), "--env", "RECIPE")
 
     parser.set_defaults(run=run)
 
 
-def _algorithm(words: list[str]) -> str | None:
-    """Return the first word that is neither a flag nor a flag's value."""
+def _settings(parser: Parser, algorithm: str) -> type:
+    """Add an algorithm's own settings, in groups. Returns its Config."""
+    from offbench.common.settings import fields
+    from offbench.training.registry import load_algorithm
+
+    config = load_algorithm(algorithm).Config
+    titles = {
+        "method": f"settings of {algorithm}",
+        "optimization": f"optimization of {algorithm}",
+        "ours": "extensions that are not in the paper",
+    }
+    groups: dict[str, Any] = {}
+    members = fields(config)
+    for kind, title in titles.items():
+        for name, field in members.items():
+            if _kind(name, field) != kind:
+                continue
+            if kind not in groups:
+                groups[kind] = parser.add_argument_group(title)
+            action = groups[kind].add_argument(
+                f"--{name.replace('_', '-')}",
+                dest=f"setting_{name}",
+                nargs="+",
+                metavar="N,N" if isinstance(field.default, tuple) else "X",
+                default=argparse.SUPPRESS,
+                help=_help(field).replace("%", "%%"),
+            )
+            completed(action, functools.partial(list, field.metadata.get("choices") or ()))
+    return config
+
+
+def _kind(name: str, field: dataclasses.Field[Any]) -> str:
+    """Return the group of a setting in the help: `method`, `optimization` or `ours`."""
+    if field.metadata.get("help", "").startswith("ours"):
+        return "ours"
+    return "optimization" if name in OPTIMIZATION or name.endswith(("learning_rate", "hidden")) else "method"
+
+
+def _notices(config: type, settings: Mapping[str, Any]) -> Iterator[str]:
+    """Return what a user should know of the values of settings, as the algorithm's fields have it."""
+    from offbench.common.settings import fields
+
+    for name, field in fields(config).items():
+        values = settings.get(name, [field.default])
+        for value, text in field.metadata.get("notes", {}).items():
+            if value in (values if isinstance(values, list) else [values]):
+                yield text
+
+
+def _algorithm(words: list[str]) -> tuple[str | None, dict[str, Any]]:
+    """Return the algorithm, the first word that is neither a flag nor a flag's value, and the settings in its name.
+
+    A method's name from a table is understood: `bdb (beta=0.5)` is bdb with beta 0.5.
+    """
     for before, word in zip(["", *words], words, strict=False):
         taken = before.startswith("--") and "=" not in before and not any(s.startswith(before) for s in SWITCHES)
         if not taken and not word.startswith("-"):
-            return word
-    return None
+            name, bracket, rest = word.partition(" (")
+            parts = [part.strip() for part in rest.removesuffix(")").split(",")] if bracket else []
+            pairs = [part.partition("=") if "=" in part else ("beta", "=", part) for part in parts]
+            return name, {key: [value] for key, _, value in pairs}
+    return None, {}
 
 
 def _machine(parser: Parser) -> None:
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
-    parser.add_argument("--workers", type=whole, help="processes for training and evaluation (default: one a core)")
-    parser.add_argument("--stack", type=auto, default="auto", help="most runs that train as one program (auto or N)")
+    parser.add_argument("--workers", type=whole, help="processes for training and evaluation (default: one per core)")
+    parser.add_argument("--stack", type=auto, default="auto", help="most runs that train as one program: auto or N")
     parser.add_argument(
         "--precision",
         default="float32",
-        help="of matrix products: float32, tf32 (GPUs), bfloat16 (GPUs and some processors) (default: float32)",
+        help="of matrix products: float32, tf32 (GPUs), bfloat16 (GPUs, some CPUs) (default: float32)",
     )
-    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the run directories (default: runs)")
+    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the runs (default: runs)")
     trust(parser)
 
 
@@ -95,13 +146,14 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
     """Add the arguments of `benchmark`."""
     from offbench.benchmarks.grid import shipped_grids
 
-    parser.add_argument("grid", metavar="GRID", help=f"{', '.join(shipped_grids())}, or a grid file")
-    parser.add_argument("--plan", action="store_true", help="print runs, cost and disk, and do nothing")
-    parser.add_argument("--budget", metavar="TIME", help="stop training cleanly after 90s, 9m or 2h")
-    parser.add_argument("--shard", type=share, default=(0, 1), metavar="I/N", help="the I-th of N shares, I from 0")
+    grid = parser.add_argument("grid", metavar="GRID", help=f"{', '.join(shipped_grids())}, or a grid file")
+    completed(grid, shipped_grids)
+    parser.add_argument("--plan", action="store_true", help="print the runs, their cost and disk space, and exit")
+    parser.add_argument("--budget", metavar="TIME", help="stop after this time with checkpoints: 90s, 9m or 2h")
+    parser.add_argument("--shard", type=share, default=(0, 1), metavar="I/N", help="run share I of N, counted from 0")
     parser.add_argument("--executor", choices=("local", "ray"), default="local", help="default: local processes")
     parser.add_argument(
-        "--address", help="of the Ray cluster, e.g. auto or ray://head:10001 (default: start one here)"
+        "--address", help="address of the Ray cluster, e.g. auto or ray://head:10001 (default: start one here)"
     )
     _machine(parser)
 
@@ -130,9 +182,12 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
         bench = prepare(**arguments)
         finished = benchmark(bench, budget=budget, shard=shard, executor=where, command=command)
         if rows := normalize.score_some(bench.started()):  # a small budget ends before there are any
-            print(normalize.render(rows))
-        if not finished:
-            print("stopped at the budget; the same command goes on", file=sys.stderr)
+            print_scores(rows)
+        runs = [] if arguments["runs"] == "runs" else ["--runs", arguments["runs"]]
+        if finished:
+            hint("offbench", "report", *runs)
+        else:
+            note("stopped at the budget; rerun the same command to resume")
 
     parser.set_defaults(run=run)
 
@@ -141,4 +196,6 @@ def _help(field: dataclasses.Field[Any]) -> str:
     """Return a setting's help, with the words that it may be and its default."""
     words = " | ".join(field.metadata.get("choices") or ())
     default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else str(field.default)
-    return f"{field.metadata.get('help', '')} ({words}{'; ' if words else ''}default: {default})"
+    return (
+        f"{field.metadata.get('help', '').removeprefix('ours: ')} ({words}{'; ' if words else ''}default: {default})"
+    )

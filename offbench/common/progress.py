@@ -1,4 +1,4 @@
-"""Progress of long work: a bar with rate and time left on a terminal, a plain line now and then elsewhere."""
+"""Progress of long work: a bar with rate and time left on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ import time
 from types import TracebackType
 from typing import Any
 
-from tqdm import tqdm
+from offbench.common.terminal import console, is_terminal
 
-PLAIN_INTERVAL = 30.0  # seconds between two plain lines
-
-
-BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}, {rate_fmt}{postfix}]"  # the time left is ours, in the postfix
+PLAIN_INTERVAL = 30.0  # seconds between two plain lines without news
+REFRESH_INTERVAL = 0.1  # seconds between two pictures of the bar
 
 
 class Progress:
     """Counts steps towards a total. Writes to stderr, so that stdout stays for results.
 
     Where steps differ in cost, their work (in seconds, or any other unit) is counted beside them, for the time left.
+    Without a terminal, every new note (such as the score of an evaluation) gets a line, and so does every half minute.
     """
 
     def __init__(self, total: int, what: str, start: int = 0, work: float | None = None) -> None:
@@ -26,21 +25,22 @@ class Progress:
         self._work: float = total if work is None else work
         self._worked: float = start
         self._first_work: float = start
-        self._first, self._note = start, ""
+        self._first, self._note, self._printed = start, "", -1
         self._began = self._last = time.monotonic()
         self._bar: Any = None
-        if sys.stderr.isatty():
-            self._bar = tqdm(
-                total=total, initial=start, desc=what, unit="step", unit_scale=True, smoothing=0.05, bar_format=BAR
-            )
+        if is_terminal(sys.stderr):
+            self._bar = _bar()
+            self._task = self._bar.add_task(what, total=total, completed=start, details=self._details())
+            self._bar.start()
 
     def __enter__(self) -> Progress:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, _: object, __: TracebackType | None) -> None:
         if self._bar is not None:
-            self._bar.close()
-        elif kind is None and self.done > self._first:
+            self._update()
+            self._bar.stop()
+        elif kind is None and self.done > self._first and self._printed != self.done:
             self._print()
 
     def skip(self, done: int, work: float | None = None) -> None:
@@ -49,37 +49,59 @@ class Progress:
         self._first += done
         self._worked += done if work is None else work
         self._first_work += done if work is None else work
-        if self._bar is not None:
-            self._bar.initial += done
-            self._bar.update(done)
 
     def say(self, line: str) -> None:
         """Print a line of its own, above the bar."""
         if self._bar is not None:
-            self._bar.write(line, file=sys.stderr)
+            self._bar.console.print(line, soft_wrap=True)
         else:
             print(line, file=sys.stderr, flush=True)
 
     def to(self, done: int, note: str = "", work: float | None = None) -> None:
         """Say that `done` units are done, with a note such as the last score."""
-        step, self.done, self._note = done - self.done, done, note or self._note
+        news = note not in ("", self._note)
+        self.done, self._note = done, note or self._note
         self._worked = done if work is None else work
+        waited = time.monotonic() - self._last
         if self._bar is not None:
-            self._bar.set_postfix_str(self._rest(), refresh=False)
-            self._bar.update(step)
-        elif time.monotonic() - self._last > PLAIN_INTERVAL:
+            if waited >= REFRESH_INTERVAL:
+                self._update()
+        elif news or waited > PLAIN_INTERVAL:
             self._print()
 
-    def _rest(self) -> str:
+    def _update(self) -> None:
+        self._last = time.monotonic()
+        self._bar.update(self._task, completed=self.done, details=self._details(), refresh=True)
+
+    def _rate(self) -> float:
+        return (self.done - self._first) / max(time.monotonic() - self._began, 1e-9)
+
+    def _left(self) -> str:
         worked = self._worked - self._first_work
         left = (self._work - self._worked) * (time.monotonic() - self._began) / worked if worked else float("inf")
-        return f"{duration(left)} left" + (f", {self._note}" if self._note else "")
+        return f"{duration(left)} left"
+
+    def _details(self) -> str:
+        parts = [f"{self.done:,}/{self.total:,}", f"{self._rate():,.0f} steps/s", self._left(), self._note]
+        return ", ".join(filter(None, parts))
 
     def _print(self) -> None:
-        self._last = time.monotonic()
-        rate = (self.done - self._first) / max(self._last - self._began, 1e-9)
-        line = f"{self.what}: {self.done:,}/{self.total:,} steps, {rate:,.0f} steps/s, {self._rest()}"
-        print(line, file=sys.stderr, flush=True)
+        self._last, self._printed = time.monotonic(), self.done
+        parts = [f"{self.what}: {self.done:,}/{self.total:,} steps", f"{self._rate():,.0f} steps/s", self._left()]
+        print(", ".join(filter(None, [*parts, self._note])), file=sys.stderr, flush=True)
+
+
+def _bar() -> Any:
+    """Return rich's bar for one task: title, bar, percent, details that wrap below where the terminal is narrow."""
+    from rich import progress
+
+    columns = [
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(bar_width=None),
+        progress.TaskProgressColumn(),
+        progress.TextColumn("{task.fields[details]}", style="dim", markup=False),
+    ]
+    return progress.Progress(*columns, console=console(sys.stderr), auto_refresh=False, expand=True)
 
 
 def duration(seconds: float) -> str:

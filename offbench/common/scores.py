@@ -1,4 +1,4 @@
-"""Scores: normalisation against named references, and the statistics of few seeds."""
+"""Scores: normalization against named references, and the statistics of few seeds."""
 
 from __future__ import annotations
 

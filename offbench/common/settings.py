@@ -29,6 +29,7 @@ def setting(
     high: float | None = None,
     choices: tuple[str, ...] | None = None,
     per_run: bool = False,
+    notes: Mapping[str, str] | None = None,
 ) -> Any:
     """Declare a dataclass field: its default, its help and the values it may take.
 
@@ -36,6 +37,7 @@ def setting(
         low, high: inclusive bounds; `above` is an exclusive lower bound.
         choices: the words a string may be.
         per_run: runs that differ in this setting may train in one stack.
+        notes: {value: what a user should know who trains with it}.
     """
     metadata = {
         "help": help,
@@ -44,6 +46,7 @@ def setting(
         "high": high,
         "choices": choices,
         "per_run": per_run,
+        "notes": notes or {},
     }
     return dataclasses.field(default=default, metadata=metadata)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 
@@ -14,6 +15,26 @@ def plural(number: int, noun: str) -> str:
 def counted(number: int, noun: str) -> str:
     """Return `1 run`, `0 runs` or `1,200 runs`."""
     return f"{number:,} {plural(number, noun)}"
+
+
+def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], names: int = 1) -> list[str]:
+    """Return a table as lines of text, a rule below its header; the columns after the first `names` align right."""
+    widths = [max(len(line[column]) for line in [header, *rows]) for column in range(len(header))]
+    return [
+        "  ".join(
+            f"{cell:{'<' if i < names else '>'}{width}}"
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in [header, ["-" * width for width in widths], *rows]
+    ]
+
+
+def compact(number: int) -> str:
+    """Return a number of steps in few characters: `1M`, `300k`, `12.5k`, `700`."""
+    for unit, size in (("M", 1_000_000), ("k", 1_000)):
+        if abs(number) >= size and number % (size // 10) == 0:
+            return f"{number / size:g}{unit}"
+    return f"{number:,}"
 
 
 # control characters but tab and line feed, and those that turn the direction of text

@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from offbench.analysis.results import REFERENCES, Entry, Method, Results, Task
+from offbench.analysis.methods import Method
+from offbench.analysis.results import REFERENCES, Entry, Results, Task
 from offbench.analysis.statistics import Estimate, Scores, curve, iqm, profile
+from offbench.common.text import compact
 
 INK = "#21252b"  # text and axes; the page replaces it by its own text colour
 GRID = "#8b93a0"
@@ -109,7 +111,7 @@ def iqm_figure(found: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[M
                 axes.plot([estimate.low, estimate.high], [row, row], color=color, linewidth=7, alpha=0.35)
             axes.plot([estimate.value] * 2, [row - 0.3, row + 0.3], color=color, linewidth=2.5)
         _named_rows(axes, [looks[method].label for method in found])
-        axes.set(xlabel="IQM of normalised scores")
+        axes.set(xlabel="IQM of normalized scores")
 
     text = ", ".join(f"{method.label} {estimate}" for method, (estimate, _) in found.items())
     caption = "Interquartile mean over all tasks and its 95% stratified bootstrap interval."
@@ -124,7 +126,7 @@ def profile_figure(found: Mapping[Method, tuple[Estimate, Scores]], looks: Mappi
     def paint(axes: Any) -> None:
         for method, (_, scores) in found.items():
             _band(axes, taus.tolist(), profile(scores, taus.tolist()), looks[method])
-        axes.set(xlabel="normalised score τ", ylabel="fraction of runs above τ", ylim=(-0.02, 1.02))
+        axes.set(xlabel="normalized score τ", ylabel="fraction of runs above τ", ylim=(-0.02, 1.02))
 
     halves = {m.label: profile(s, [50.0])[0].value for m, (_, s) in found.items()}
     text = ", ".join(f"{label} {100 * half:.0f}%" for label, half in halves.items())
@@ -152,7 +154,7 @@ def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure |
         for method, (shown, curves) in whole.items():
             points = [iqm({t: v[:, s.index(step)].tolist() for t, (s, v) in curves.items()}, 2000) for step in shown]
             _band(axes, shown, points, looks[method])
-        axes.set(xlabel="updates", ylabel="IQM of normalised scores", title="all tasks")
+        axes.set(xlabel="updates", ylabel="IQM of normalized scores", title="all tasks")
 
     caption = "Interquartile mean over all tasks, 95% interval shaded; methods that have all tasks."
     alt = f"Learning curves of the interquartile mean over all tasks: {', '.join(m.label for m in whole)}."
@@ -225,7 +227,7 @@ def shortened(text: str, most: int) -> str:
 
 
 def _unit(task: Task) -> str:
-    return "return" if task.reference is None else f"normalised score ({REFERENCES[task.reference]})"
+    return "return" if task.reference is None else f"normalized score ({REFERENCES[task.reference]})"
 
 
 def _legend(entries: Sequence[Entry], looks: Mapping[Method, Line]) -> list[Line]:
@@ -255,7 +257,7 @@ def _draw(
         axes.patch.set_alpha(0)
         paint(axes)
         axes.ticklabel_format(axis="x", style="plain", useOffset=False)
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}" if abs(value) >= 10 else f"{value:g}")
+        axes.xaxis.set_major_formatter(lambda value, _: compact(round(value)) if abs(value) >= 10 else f"{value:g}")
         axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
         inline = _saved(fig, "svg").decode()
         fig.patch.set_alpha(1)

@@ -191,7 +191,9 @@ def _seeds(results: Results, entry: Entry) -> Markup:
 
 def relative(results: Results, run: Run) -> str:
     """Return a run's folder as seen from the folder of all runs, so that a page does not name its machine."""
-    return run.folder.relative_to(results.root).as_posix()
+    root = next(root for root in results.roots if run.folder.is_relative_to(root))
+    inside = run.folder.relative_to(root)
+    return (inside if len(results.roots) == 1 else root.name / inside).as_posix()
 
 
 def _words(found: object) -> str:

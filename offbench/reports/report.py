@@ -14,7 +14,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from offbench.analysis.results import Entry, Method, Results, read_results
+from offbench.analysis.methods import Method
+from offbench.analysis.results import Entry, Folders, Results, read_results
 from offbench.common.errors import OffbenchError
 from offbench.common.files import write_bytes
 from offbench.common.tables import Table, files
@@ -26,30 +27,42 @@ from offbench.reports.figures import Figure, Line
 from offbench.reports.markup import Markup, join, tag
 from offbench.reports.page import Section, boxes, figures, page, relative, table
 from offbench.reports.similarity import similarity_tables
-from offbench.reports.tables import scale
+from offbench.reports.sweep import best_table
+from offbench.reports.tables import is_papers_grid, scale
 
 PAGE = "index.html"
+TITLE = "Offline RL benchmark"
 GENERATOR = '<meta name="generator" content="offbench">'  # by which an older report is known
 STATES = {"unfinished": ("is unfinished", "are unfinished"), "diverged": ("diverged", "diverged")}
 
 
-def report(runs: str | Path = "runs", out: str | Path = "report") -> Path:
-    """Write the report of all runs below a folder.
+def report(
+    runs: Folders = "runs",
+    out: str | Path = "report",
+    *,
+    title: str | None = None,
+    datasets: Sequence[str] | None = None,
+    methods: Sequence[str] | None = None,
+) -> Path:
+    """Write the report of the runs below one or more folders.
 
     Args:
-        runs: the folder of the run directories; one run is enough, unfinished ones are marked.
+        runs: the folder of the run directories, or several; one run is enough, unfinished ones are marked.
         out: the report's folder; an older report in it is replaced.
+        title: of the page.
+        datasets: only these, by id or by a pattern such as `hopper-*`.
+        methods: only these, by a name as tables have it.
 
     Returns:
         The page.
 
     Raises:
-        OffbenchError: no evaluated runs, a damaged one, or the folder cannot be written.
+        OffbenchError: no evaluated runs, no such dataset or method, a damaged run, or the folder cannot be written.
     """
     folder = Path(out)
     if folder.suffix.lower() in (".html", ".htm", ".pdf"):
         raise OffbenchError(f"a report is a folder with an {PAGE} in it: give --out {folder.with_suffix('')}")
-    results = read_results(runs)
+    results = read_results(runs, datasets=datasets or (), methods=methods or ())
     before = _older(folder)
     found, pictures = _tables(results), _figures(results)
     written = {f"tables/{one.name}.{end}": data for one in found.values() for end, data in files(one).items()}
@@ -59,7 +72,7 @@ def report(runs: str | Path = "runs", out: str | Path = "report") -> Path:
         write_bytes(folder / name, data)
     for path in before - {folder / name for name in written}:
         path.unlink(missing_ok=True)
-    content = page("Offline RL benchmark", _lead(results), list(_sections(results, found, pictures)), boxes(results))
+    content = page(title or TITLE, _lead(results), list(_sections(results, found, pictures)), boxes(results))
     write_bytes(folder / PAGE, content)  # last: a page's links all lead somewhere
     return folder / PAGE
 
@@ -82,6 +95,8 @@ def _older(folder: Path) -> set[Path]:
 
 def _tables(results: Results) -> dict[str, Table]:
     known = [tables.score_table(results), tables.seed_table(results), dataset_table(results)]
+    if best := best_table(results):
+        known.append(best)
     known += similarity_tables(results)
     beside = tables.beside_table(results)
     aggregates = tables.iqms(results)
@@ -156,12 +171,14 @@ def _sections(
 ) -> Iterator[Section]:
     words = "Click a number to see where it comes from: seeds, commands, versions, hardware. Click a header to sort."
     yield Section("scores", found["scores"].title, [table(found["scores"])], words)
+    if "best" in found:
+        yield Section("best", found["best"].title, [table(found["best"])])
     if "iqm" in found:
         parts = [figures(pictures["iqm"]), table(found["iqm"])]
         yield Section("aggregate", "Across datasets", parts)
     if "improvement" in found:
         yield Section("improvement", "Probability of improvement", [table(found["improvement"])])
-    words = "The BDB paper's Figure 4 shows the same of its datasets." if "beside" in found else ""
+    words = "The BDB paper's Figure 4 shows the same for its datasets." if is_papers_grid(results) else ""
     yield Section("curves", "Learning curves", [figures(pictures["curves"])], words)
     yield Section("finals", "Final scores, seed by seed", [figures(pictures["finals"])])
     if "beside" in found:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from offbench.analysis.results import Entry, Method, Results
+from offbench.analysis.methods import Method
+from offbench.analysis.results import Entry, Results
 from offbench.common.errors import OffbenchError
 from offbench.common.files import read_json
 from offbench.common.scores import mean_std
 from offbench.common.tables import Cell, Table
-from offbench.reports.tables import NONE, plus_minus, published, row_name
+from offbench.reports.tables import NONE, is_papers_grid, plus_minus, published, row_name
 
 
 def similarity_tables(results: Results) -> list[Table]:
@@ -44,8 +45,9 @@ def similarity_tables(results: Results) -> list[Table]:
     ]
     header = ["level", "environment", *[method.label for method in methods]]
     columns = ["level", "environment", "method", "by Q (%)", "by action (%)", "paper (%)", "seeds", "step", "samples"]
+    title = "Similar score (the BDB paper's Table 2)" if is_papers_grid(results) else "Similar score"
     return [
-        Table("similarity", "Similar score (the BDB paper's Table 2)", header, rows, notes, 2),
+        Table("similarity", title, header, rows, notes, 2),
         Table("similarity-details", "Similar score in both readings", [*columns, "tolerances"], details, [], 3),
     ]
 

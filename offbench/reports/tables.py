@@ -8,7 +8,8 @@ import importlib.resources
 from collections.abc import Mapping, Sequence
 
 from offbench.analysis.compare import comparable, differences, favoured, partners
-from offbench.analysis.results import REFERENCES, Entry, Method, Results, Task, window_words
+from offbench.analysis.methods import Method, unnamed_settings
+from offbench.analysis.results import REFERENCES, Entry, Results, Task, window_words
 from offbench.analysis.statistics import Estimate, Scores, improvement, iqm, paired
 from offbench.common.scores import LAST, mean_std
 from offbench.common.tables import Cell, Table
@@ -16,11 +17,12 @@ from offbench.common.text import counted
 from offbench.training.run import DIGITS, RunConfig
 
 PAPER = "BDB paper, Table 1"
+PAPER_METHODS = {"td3_bc", "cql", *(f"bdb beta={beta}" for beta in ("0.25", "0.50", "0.75", "adaptive"))}
 NONE = Cell("-")
 FEW_SEEDS = "No interval where a task has a single seed; with few seeds it covers less than 95% (docs/statistics.md)."
 DIFFERENT_DATA = (
     "The datasets are not the same: the published numbers are of D4RL's v0 and v2 files, recorded in older "
-    "environments by other agents and normalised by D4RL's constants; ours are of the datasets named here. Read them "
+    "environments by other agents and normalized by D4RL's constants; ours are of the datasets named here. Read them "
     "side by side, not as a reproduction to the decimal."
 )
 
@@ -29,6 +31,14 @@ def published(name: str) -> list[dict[str, str]]:
     """Return the rows of a shipped table of published numbers: `scores` or `similarity`."""
     path = importlib.resources.files("offbench.reports") / "published" / f"{name}.csv"
     return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+
+
+def is_papers_grid(results: Results) -> bool:
+    """Return whether these are the BDB paper's methods, all of them, on datasets of its tables."""
+    rows = [row for row in published("scores") if row["source"] == PAPER]
+    methods = {method.published for method in results.methods}
+    places = {(row["env"], row["level"]) for row in rows}
+    return methods >= PAPER_METHODS and all(task.place in places for task in results.tasks)
 
 
 def plus_minus(found: tuple[float, float | None], digits: int = 1) -> str:
@@ -66,7 +76,7 @@ def score_table(results: Results) -> Table:
     beside = any(cell.below for row in rows for cell in row[2:])
     return Table(
         "scores",
-        "Scores (the BDB paper's Table 1)" if beside else "Scores",
+        "Scores (the BDB paper's Table 1)" if is_papers_grid(results) else "Scores",
         ["level", "environment", *[method.label for method in results.methods]],
         rows,
         _score_notes(results, seeds, beside),
@@ -129,6 +139,8 @@ def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
             "In a row whose cells name their evaluations, the scores are of evaluations at different steps: they "
             "cannot be compared, and none is in bold."
         )
+    if left_out := unnamed_settings(results.methods):
+        notes.append(f"Settings that differ from the defaults: {'; '.join(left_out)}.")
     if beside:
         notes.append(f"“paper”: {PAPER} (5 seeds, 1M steps). {DIFFERENT_DATA}")
     states = set().union(*(entry.states for entry in entries))
@@ -163,8 +175,8 @@ def scale(results: Results) -> str:
     """Return what a score of these results means, in a sentence or two."""
     known = {task.reference for task in results.tasks}
     words = {
-        "dataset": "Scores are normalised by each dataset's own reference: 0 is the random policy, 100 the expert.",
-        "d4rl": "Scores are normalised by D4RL's constants, measured in older environments: 0 is their random policy, "
+        "dataset": "Scores are normalized by each dataset's own reference: 0 is the random policy, 100 the expert.",
+        "d4rl": "Scores are normalized by D4RL's constants, measured in older environments: 0 is their random policy, "
         "100 their expert.",
         None: "Datasets without a reference have no score: their rows are raw returns.",
     }
@@ -213,7 +225,7 @@ def iqm_table(results: Results, found: Mapping[Method, tuple[Estimate, Scores]])
         counts = [Cell(f"{count}", count) for count in (len(scores), runs)]
         rows.append([Cell(method.label), Cell(f"{estimate.value:.1f}", estimate.value), *numbers, *counts])
     notes = [
-        "Interquartile mean of the normalised scores of all runs of all tasks (the mean without the lowest and "
+        "Interquartile mean of the normalized scores of all runs of all tasks (the mean without the lowest and "
         "highest quarter), and its 95% interval by stratified bootstrap: seeds are resampled within each "
         f"task (Agarwal et al. 2021). {FEW_SEEDS}",
     ]

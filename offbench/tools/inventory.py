@@ -1,8 +1,10 @@
-"""`list`: environments, levels, algorithms and local datasets."""
+"""`list`: environments, levels, algorithms, local datasets and runs."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from offbench.agents.ladder import read_ladder
@@ -13,8 +15,30 @@ from offbench.envs.recipes import load_recipe, names
 from offbench.training.registry import algorithm_names
 
 
-def inventory() -> dict[str, Any]:
-    """Return environments (with their shipped ladders), levels, algorithms and local datasets."""
+def inventory(what: str | None = None, *, runs: str | Path = "runs") -> dict[str, Any]:
+    """Return what is here.
+
+    Args:
+        what: `environments` (with their shipped ladders), `levels`, `algorithms`, `datasets` (local ones) or `runs`;
+            None for all but the runs.
+        runs: the folder of the runs.
+
+    Raises:
+        OffbenchError: the folder of the runs holds none, or an unknown `what`.
+    """
+    parts: dict[str, Callable[[], Any]] = {
+        "environments": _environments,
+        "levels": lambda: list(LEVELS),
+        "algorithms": algorithm_names,
+        "datasets": _datasets,
+        "runs": lambda: _runs(runs),
+    }
+    if what is not None and what not in parts:
+        raise OffbenchError(f"no list of {what!r}; there are {', '.join(parts)}")
+    return {name: part() for name, part in parts.items() if name == what or (what is None and name != "runs")}
+
+
+def _environments() -> dict[str, Any]:
     environments = {}
     for name in names():
         recipe = load_recipe(name)
@@ -24,6 +48,10 @@ def inventory() -> dict[str, Any]:
             "expert_return": ladder.expert_return if ladder else None,
             "random_return": ladder.random_return if ladder else None,
         }
+    return environments
+
+
+def _datasets() -> dict[str, Any]:
     datasets = {}
     for dataset_id in minari_store.local_ids():
         try:
@@ -34,32 +62,64 @@ def inventory() -> dict[str, Any]:
             continue
         full = minari_store.provenance(metadata).get("full_size")
         short = isinstance(full, int) and counts["total_steps"] < full
-        datasets[dataset_id] = counts | {
-            "algorithm_name": metadata.get("algorithm_name"),
-            "short_of": full if short else None,
-        }
-    return {
-        "environments": environments,
-        "levels": list(LEVELS),
-        "algorithms": algorithm_names(),
-        "datasets": datasets,
-    }
+        more = {"algorithm_name": metadata.get("algorithm_name"), "short_of": full if short else None}
+        datasets[dataset_id] = counts | more
+    return datasets
 
 
-def inventory_lines() -> list[str]:
-    """Return `inventory` as text."""
-    found = inventory()
-    lines = ["environments"]
-    for name, env in found["environments"].items():
-        known = "no behaviour agent shipped: the first collect trains one"
-        if env["expert_return"] is not None:
-            known = f"expert {env['expert_return']:.0f}, random {env['random_return']:.0f}"
-        lines.append(f"  {name:<20}{env['env_id']:<24}{known}")
-    lines += ["levels", f"  {', '.join(found['levels'])}, or a fraction such as 0.6"]
-    lines += ["algorithms", f"  {', '.join(found['algorithms'])}", f"datasets in {minari_store.root()}"]
-    for dataset_id, data in found["datasets"].items():
-        short = f"   short of {data['short_of']:,} steps" if data["short_of"] else ""
-        lines.append(f"  {dataset_id:<32}{data['total_steps']:>10,} steps{data['total_episodes']:>8,} episodes{short}")
-    if not found["datasets"]:
-        lines.append("  none; record one with `offbench collect ENV --level LEVEL`")
-    return lines
+def _runs(root: str | Path) -> list[dict[str, Any]]:
+    from offbench.analysis.results import read_results
+
+    results = read_results(root)
+    rows: list[dict[str, Any]] = []
+    for entry in results.entries.values():
+        rows += [
+            {
+                "dataset": entry.task.name,
+                "method": entry.method.label,
+                "seed": trained.seed,
+                "step": trained.reached,
+                "steps": trained.steps,
+                "state": trained.state,
+                "folder": str(trained.run.folder),
+            }
+            for trained in entry.runs
+        ]
+    return rows
+
+
+Section = tuple[str, list[str], list[list[str]]]
+
+
+def sections(contents: Mapping[str, Any]) -> Iterator[Section]:
+    """Return `inventory` as (title, header, rows) of tables; the header is empty where rows are lines of text."""
+    if "environments" in contents:
+        rows = [
+            [name, env["env_id"], *_numbers(env, "random_return", "expert_return")]
+            for name, env in contents["environments"].items()
+        ]
+        yield "environments", ["name", "Gymnasium id", "random return", "expert return"], rows
+    for name, more in (("levels", ", or a fraction such as 0.6"), ("algorithms", "")):
+        if name in contents:
+            yield name, [], [[", ".join(contents[name]) + more]]
+    if "datasets" in contents:
+        found = contents["datasets"].items()
+        rows = [[name, _transitions(data), f"{data['total_episodes']:,}"] for name, data in found]
+        none = [["none; record one with `offbench collect ENV --level LEVEL`"]]
+        header = ["id", "transitions", "episodes"] if rows else []
+        yield f"datasets in {minari_store.root()}", header, rows or none
+    if "runs" in contents:
+        rows = [
+            [run["dataset"], run["method"], str(run["seed"]), f"{run['step']:,}", f"{run['steps']:,}", run["state"]]
+            for run in contents["runs"]
+        ]
+        yield "runs", ["dataset", "method", "seed", "step", "of", "state"], rows
+
+
+def _transitions(data: Mapping[str, Any]) -> str:
+    short = f" of {data['short_of']:,}" if data["short_of"] else ""
+    return f"{data['total_steps']:,}{short}"
+
+
+def _numbers(values: Mapping[str, Any], *keys: str) -> Sequence[str]:
+    return [f"{values[key]:.0f}" if values[key] is not None else "-" for key in keys]

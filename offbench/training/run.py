@@ -69,6 +69,7 @@ class RunConfig:
         env_spec: the environment it is evaluated in, as EnvSpec JSON; None if the dataset names none.
         device, precision, versions, hardware: of the first session.
         sessions: the later sessions that were trained with something else.
+        label: the method's name in tables, if a grid gives one.
     """
 
     format: str = FORMAT
@@ -90,6 +91,7 @@ class RunConfig:
     versions: dict[str, Any] = field(default_factory=dict)
     hardware: dict[str, Any] = field(default_factory=dict)
     sessions: tuple[Session, ...] = ()
+    label: str = ""
 
     def __post_init__(self) -> None:
         """Raise OffbenchError for numbers that no run has."""

@@ -67,9 +67,9 @@ def test_the_scores_stand_below_whose_they_are(home: Path) -> None:
     scores(home / "runs", "bdb", [50.0, 50.0], variant="beta=0.5")
     lines = offbench.compare("td3_bc", "bdb/beta=0.5").lines()
     assert lines[2:5] == [
-        "dataset           seed  td3_bc  bdb beta=0.5  difference",
-        "hopper-medium-v0     0    51.0          50.0        +1.0",
-        "hopper-medium-v0     1   152.0          50.0      +102.0",
+        "dataset           seed  td3_bc  bdb (beta=0.5)  difference",
+        "hopper-medium-v0     0    51.0            50.0        +1.0",
+        "hopper-medium-v0     1   152.0            50.0      +102.0",
     ]
     assert "note: 1 run has no partner of the same dataset and seed and is left out" in lines
 
@@ -97,26 +97,28 @@ def test_an_algorithm_alone_is_its_default_or_only_variant(home: Path) -> None:
     scores(home / "runs", "cql", [1.0], variant="alpha=1")
     scores(home / "runs", "bdb", [1.0], variant="beta=0.5")
     scores(home / "runs", "bdb", [2.0])
-    assert (offbench.compare("cql", "bdb").a, offbench.compare("cql", "bdb").b) == ("cql alpha=1", "bdb")
+    assert (offbench.compare("cql", "bdb").a, offbench.compare("cql", "bdb").b) == ("cql", "bdb")
 
 
 def test_a_variant_may_be_named_as_tables_name_it(home: Path) -> None:
-    """The adaptive beta is BDB's default: a folder says `default`, a table `beta=adaptive`."""
+    """The adaptive beta is BDB's default: a folder says `default`, a table `bdb (adaptive)`."""
     scores(home / "runs", "td3_bc", [1.0])
     for seed, value in enumerate([2.0, 3.0]):
         run = made_run(home / "runs", "hopper-medium-v0", "bdb", "default", seed, 0, settings={"beta": "adaptive"})
         run.write_evaluations({30_000: [(value, 5)] * 3})
-    assert compare("bdb/beta=adaptive", "td3_bc", runs="runs").a == "bdb beta=adaptive"
-    with pytest.raises(OffbenchError, match=r"cql has no evaluated runs here; bdb, td3_bc have"):
+    for name in ("bdb", "bdb (adaptive)", "bdb/default", "bdb/beta=adaptive", "bdb/adaptive", "bdb beta=adaptive"):
+        assert compare(name, "td3_bc", runs="runs").a == "bdb (adaptive)"
+    assert compare("bdb (adaptive) (30,000 steps)", "td3_bc", runs="runs").a == "bdb (adaptive)"  # a column's heading
+    with pytest.raises(OffbenchError, match=r"cql has no evaluated runs here; there are 'td3_bc', 'bdb \(adaptive\)'"):
         compare("cql", "td3_bc", runs="runs")
 
 
 @pytest.mark.parametrize(
     ("a", "b", "message"),
     [
-        ("td3bc", "bdb/beta=0.5", "unknown algorithm 'td3bc': did you mean 'td3_bc'?"),
-        ("td3_bc", "bdb", "bdb has several variants: give one of bdb/beta=0.5, bdb/beta=0.75"),
-        ("td3_bc", "bdb/beta=0.55", "unknown variant of bdb 'beta=0.55': did you mean 'beta=0.5'?"),
+        ("td3bc", "bdb/beta=0.5", "unknown method 'td3bc': did you mean 'td3_bc'?"),
+        ("td3_bc", "bdb", "bdb has several variants: give one of 'bdb (beta=0.5)', 'bdb (beta=0.75)'"),
+        ("td3_bc", "bdb/beta=0.55", "no method 'bdb/beta=0.55' here: did you mean 'bdb (beta=0.5)'?"),
         ("td3_bc", "td3_bc/default", "are the same runs"),
         ("td3_bc", "cql", "share no dataset with a seed in common"),
         ("td3_bc", "bc", "raw returns, which do not average"),

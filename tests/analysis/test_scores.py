@@ -155,7 +155,7 @@ def test_runs_without_an_evaluation_are_counted(capsys: pytest.CaptureFixture[st
     write_run(0, [90.0])
     main(["normalize"])
     assert capsys.readouterr().err == ""
-    for seed, words in ((1, "1 run has no evaluation yet"), (2, "2 runs have no evaluation yet")):
+    for seed, words in ((1, "note: 1 run without an evaluation yet"), (2, "note: 2 runs without an evaluation yet")):
         write_run(seed, [])
         main(["normalize", "--format", "json"])
         said = capsys.readouterr()

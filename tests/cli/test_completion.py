@@ -1,87 +1,78 @@
-"""`offbench completion SHELL`: the scripts are given to the shells themselves."""
+"""Completion: the shells source `offbench completion SHELL`; offbench answers what may come next."""
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from offbench.cli.main import COMMANDS
+from offbench.cli.main import BY_NAME
 from offbench.training.registry import algorithm_names
+from tests.made_runs import made_run
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture
-def bash(offbench_cli: Cli, home: Path) -> Callable[..., list[str]]:
-    """What bash offers after some words; the last one is not finished."""
-    if not shutil.which("bash"):
-        pytest.skip("no bash here")
-    done = offbench_cli("completion", "bash")
-    assert done.returncode == 0, done.stderr
-    (home / "completion.bash").write_text(done.stdout)
+def offered(home: Path) -> Callable[[str], list[str]]:
+    """What is offered at the end of a line, as argcomplete's bash function asks for it: the answer is on fd 8."""
 
-    def offered(*words: str) -> list[str]:
-        line = " ".join(f"'{word}'" for word in ("offbench", *words))
-        code = f"set -u; . ./completion.bash; COMP_WORDS=({line}); COMP_CWORD={len(words)}; _offbench; "
+    def ask(line: str) -> list[str]:
+        answer = home / "answer"
+        asked = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "COMP_LINE": line, "COMP_POINT": str(len(line))}
+        command = f"{sys.executable} -m offbench 8>{answer} 9>/dev/null"
         done = subprocess.run(
-            ["bash", "-c", code + 'printf "%s\\n" "${COMPREPLY[@]+"${COMPREPLY[@]}"}"'],
+            ["bash", "-c", command],
+            env=os.environ | asked | {"_ARGCOMPLETE_SUPPRESS_SPACE": "1"},
             capture_output=True,
             text=True,
             cwd=home,
             check=False,
         )
-        assert done.returncode == 0, done.stderr
-        assert not done.stderr
-        return done.stdout.split()
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+        return answer.read_text().splitlines()
 
-    return offered
-
-
-def test_bash_offers_every_command(bash: Callable[..., list[str]]) -> None:
-    assert bash("") == list(COMMANDS)
-    assert bash("coll") == ["collect"]
+    return ask
 
 
-def test_bash_offers_what_a_place_and_a_flag_may_be(bash: Callable[..., list[str]]) -> None:
-    assert bash("collect", "hop") == ["hopper"]
-    assert bash("collect", "hopper", "--level", "medium-") == ["medium-replay", "medium-expert"]
-    assert bash("train", "") == algorithm_names()
-    assert bash("benchmark", "pap") == ["paper", "paper-small"]
-    assert bash("normalize", "--format", "l") == ["latex"]
-    assert bash("completion", "f") == ["fish"]
+@pytest.mark.skipif(not shutil.which("bash"), reason="no bash here")
+def test_what_is_offered(offered: Callable[[str], list[str]], home: Path) -> None:
+    assert set(offered("offbench ")) >= set(BY_NAME)
+    assert offered("offbench coll") == ["collect"]
+    assert offered("offbench collect hop") == ["hopper"]
+    assert offered("offbench collect hopper --level medium-") == ["medium-replay", "medium-expert"]
+    assert offered("offbench collect hopper --le") == ["--level"]
+    assert [word for word in offered("offbench train ") if not word.startswith("-")] == algorithm_names()
+    assert offered("offbench benchmark paper-") == ["paper-small"]
+    assert offered("offbench normalize --format l") == ["latex"]
+    assert "--beta" in offered("offbench train bdb --b")
+    assert "--beta" not in offered("offbench train td3_bc --b")
+    assert offered("offbench train bdb --beta ad") == ["adaptive"]
+    for dataset in ("my-data-v0", "mujoco/hopper/medium-v0"):
+        (home / "minari" / dataset / "data").mkdir(parents=True)
+        (home / "minari" / dataset / "data" / "metadata.json").write_text("{}")
+    assert offered("offbench train bdb --dataset my") == ["my-data-v0"]
+    assert offered("offbench show mujoco/h") == ["mujoco/hopper/medium-v0"]
+    for variant in ("beta=0.5", "beta=0.75"):
+        made_run(home / "runs", "hopper-medium-v0", "bdb", variant, 0, 50)
+    # the shell needs its own special characters escaped
+    assert offered("offbench compare bdb") == ["bdb\\ \\(beta=0.5\\)", "bdb\\ \\(beta=0.75\\)"]
 
 
-def test_bash_offers_flags_and_an_algorithms_own_settings(bash: Callable[..., list[str]]) -> None:
-    assert bash("collect", "hopper", "--le") == ["--level"]
-    assert "--beta" in bash("train", "bdb", "--b")
-    assert "--beta" not in bash("train", "td3_bc", "--b")
-    assert "--bc-steps" in bash("train", "cql", "--dataset", "x-v0", "--b")
-
-
-def test_bash_offers_the_datasets_that_are_there_when_asked(bash: Callable[..., list[str]], home: Path) -> None:
-    assert bash("train", "bdb", "--dataset", "") == []
-    (home / "minari" / "my-data-v0").mkdir(parents=True)
-    assert bash("train", "bdb", "--dataset", "my") == ["my-data-v0"]
-    assert bash("show", "my") == ["my-data-v0"]
-
-
-@pytest.mark.parametrize("shell", ["zsh", "fish"])
-def test_other_shells_accept_their_script(shell: str, offbench_cli: Cli, home: Path) -> None:
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_shells_accept_their_script(shell: str, offbench_cli: Cli, home: Path) -> None:
     script = offbench_cli("completion", shell).stdout
-    assert "medium-replay" in script
+    assert "offbench" in script
     if not shutil.which(shell):
         pytest.skip(f"no {shell} here: its script was not tried")
     (home / "script").write_text(script)
     done = subprocess.run([shell, "-n", "script"], capture_output=True, text=True, cwd=home, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    if shell == "fish":
-        code = "source script; complete -C 'offbench collect hopper --level medium-'"
-        done = subprocess.run([shell, "-c", code], capture_output=True, text=True, cwd=home, check=False)
-        assert [line.split()[0] for line in done.stdout.splitlines()] == ["medium-expert", "medium-replay"]
 
 
 def test_an_unknown_shell_is_refused_in_one_line(offbench_cli: Cli) -> None:

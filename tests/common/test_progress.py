@@ -57,9 +57,23 @@ def test_a_terminal_shows_the_same(clock: Clock, monkeypatch: pytest.MonkeyPatch
     screen = io.StringIO()
     monkeypatch.setattr(screen, "isatty", lambda: True)
     monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
     with progress.Progress(1000, "recording") as bar:
         clock.now = 10.0
         bar.to(100, "score 3")
-    assert "recording:  10%" in screen.getvalue()
-    assert "100/1.00k [" in screen.getvalue()
-    assert "1 min 30 s left, score 3]" in screen.getvalue()
+        bar.say("a line above")
+    assert "recording" in screen.getvalue()
+    assert "10%" in screen.getvalue()
+    assert "100/1,000, 10 steps/s, 1 min 30 s left, score 3" in screen.getvalue()
+    assert "a line above\n" in screen.getvalue()
+
+
+def test_a_log_has_a_line_for_every_evaluation(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with progress.Progress(1000, "td3_bc on x-v0") as bar:
+        for step in range(10, 501, 10):
+            clock.now += 0.1
+            bar.to(step, f"score {step // 100 * 5} at step {step // 100 * 100}" if step >= 100 else "")
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.rpartition(", ")[2] for line in lines] == [f"score {5 * i} at step {100 * i}" for i in range(1, 6)]
+    assert lines[0].startswith("td3_bc on x-v0: 100/1,000 steps, 100 steps/s, 9 s left")

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 import offbench
-from offbench.analysis.results import OURS, Method, Task, read_results
+from offbench.analysis.methods import OURS, Method
+from offbench.analysis.results import Task, read_results
 from offbench.cli.main import main
 from offbench.common.files import write_json
 from offbench.common.settings import fields
@@ -68,15 +69,15 @@ def test_the_score_table_by_hand(home: Path) -> None:
     assert (
         row["td3_bc (30,000 steps)"] == "60.0 ± 26.5 (3 seeds)"
     )  # deviation of 40, 50, 90: sqrt((400 + 100 + 900) / 2)
-    assert row["bdb beta=adaptive (30,000 steps)"] == "70.0 ± ? (1 seed)"
+    assert row["bdb (adaptive) (30,000 steps)"] == "70.0 ± ? (1 seed)"
     latex = (home / "out" / "tables" / "scores.tex").read_text()
     assert r"60.0 $\pm$ 26.5 (3 seeds) & \textbf{70.0 $\pm$ ? (1 seed)}" in latex
     assert "**70.0 ± ? (1 seed)**" in (home / "out" / "tables" / "scores.md").read_text()
     # D4RL's reference of the made runs is -10 to 190: a return of 70 is 100 * 80 / 200
     beside = {row["method"]: row for row in rows(home / "out" / "tables" / "beside.csv")}
-    assert beside["bdb beta=adaptive"]["ours (D4RL's constants)"] == "40.0 ± ?"
+    assert beside["bdb (adaptive)"]["ours (D4RL's constants)"] == "40.0 ± ?"
     paper = "BDB paper, Table 1, v0 (5 seeds, mean of last 10 evaluations, 1M steps)"
-    assert beside["bdb beta=adaptive"][paper] == "100.16 ± 0.02"
+    assert beside["bdb (adaptive)"][paper] == "100.16 ± 0.02"
     page = (home / "out" / "index.html").read_text()
     assert "paper 100.16" in page
     assert ">3 seeds<" in page
@@ -121,7 +122,7 @@ def test_tasks_and_methods_in_the_papers_order(home: Path) -> None:
     results = read_results(home / "runs")
     levels = ["hopper-random-v0", "a-random-v0", "hopper-medium-v0", "walker2d-medium-v0", "hopper-expert-v0"]
     assert [task.dataset for task in results.tasks] == levels
-    labels = ["td3_bc", "cql", "bdb beta=0.25", "bdb beta=0.5", "bdb beta=0.75", "bdb beta=adaptive", "bc"]
+    labels = ["td3_bc", "cql", "bdb (beta=0.25)", "bdb (beta=0.5)", "bdb (beta=0.75)", "bdb (adaptive)", "bc"]
     assert [method.label for method in results.methods] == labels
 
 
@@ -148,7 +149,7 @@ def test_the_published_numbers_are_found_by_method() -> None:
     options = fields(load_algorithm("bdb").Config)
     assert {name for name, field in options.items() if field.metadata["help"].startswith("ours")} == OURS
     assert {"td3_bc", "cql", "bdb beta=0.50", "bdb beta=adaptive"} <= known
-    assert Method("bdb", "hidden=8x8", "adaptive").label == "bdb beta=adaptive,hidden=8x8"
+    assert Method("bdb", "hidden=8x8", "adaptive").label == "bdb (adaptive, hidden=8x8)"
 
 
 def test_one_run_of_one_seed(home: Path) -> None:
@@ -173,7 +174,7 @@ def test_runs_without_references_show_returns(home: Path) -> None:
 def test_only_d4rls_reference_is_named(home: Path) -> None:
     made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, references=(None, [0.0, 100.0]))
     page = Page(offbench.report(home / "runs", home / "out"))
-    assert "normalised by D4RL's constants" in page.text
+    assert "normalized by D4RL's constants" in page.text
 
 
 def test_unfinished_and_unbegun_runs_are_marked(home: Path) -> None:
@@ -248,7 +249,7 @@ def test_a_real_training(medium: str, home: Path) -> None:
     assert {"scores", "improvement", "similarity", "beta", "critic"} <= set(page.ids)
     ((row),) = rows(home / "out" / "tables" / "scores.csv")
     assert (row["level"], row["environment"]) == ("medium", "tiny")
-    assert any(name.startswith("bdb beta=adaptive,") for name in row)
+    assert any(name.startswith("bdb (adaptive) (") for name in row)
     (found,) = [
         r for r in rows(home / "out" / "tables" / "similarity-details.csv") if r["method"].startswith("td3_bc")
     ]
@@ -281,7 +282,6 @@ def test_the_paper_is_named_where_its_numbers_are(home: Path) -> None:
     assert "a single seed has no standard deviation" in markdown
     made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
     page = Page(offbench.report(home / "runs", home / "out"))
-    assert (home / "out" / "tables" / "scores.md").read_text().startswith("## Scores (the BDB paper's Table 1)\n")
     assert "“paper”: BDB paper, Table 1" in page.text
     assert "Learning curves" in page.text
     assert not [word for word in ("Table 1: ", "Table 2: ", "Figure 4: ") if word in page.text]
@@ -326,7 +326,7 @@ def test_an_odd_beta_is_shown_as_it_is(home: Path, beta: object) -> None:
     run = made_run(home / "runs", "hopper-medium-v0", "bdb", "odd=1", 0, 50)
     write_json(run.config_path, json.loads(run.config_path.read_text()) | {"settings": {"beta": beta}})
     (column,) = read_results(home / "runs").methods
-    assert column.label == f"bdb beta={beta},odd=1"
+    assert column.label == f"bdb (beta={beta})"  # its only variant: without the setting
     assert offbench.report(home / "runs", home / "out").exists()
 
 

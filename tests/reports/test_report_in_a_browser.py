@@ -15,7 +15,7 @@ import pytest
 
 import offbench
 from tests.browsers import VIEWS, chromium
-from tests.made_runs import made_grid
+from tests.made_runs import made_grid, made_run
 from tests.pages import hostile_runs
 
 pytestmark = pytest.mark.slow
@@ -80,6 +80,18 @@ def test_the_report_opens_sorts_and_explains_a_cell(browser: Any, home: Path, vi
         page.screenshot(path=Path(keep) / f"report-{view}.png")
     assert messages == []
     assert requests == [path.as_uri()]
+
+
+def test_seven_methods_fit_a_laptop(browser: Any, home: Path) -> None:
+    made_grid(home / "runs", envs=("hopper", "halfcheetah"), seeds=2, levels=2)
+    for seed in range(2):
+        made_run(home / "runs", "halfcheetah-medium-replay-v0", "bc", "default", seed, 20)
+    path = offbench.report(home / "runs", home / "out").absolute()
+    page = browser.new_context(viewport={"width": 1280, "height": 800}).new_page()
+    page.goto(path.as_uri())
+    frames = "[...document.querySelectorAll('main .wide')].filter(frame => frame.scrollWidth > frame.clientWidth + 1)"
+    assert page.evaluate("document.querySelectorAll('#scores thead th').length") == 9
+    assert page.evaluate(f"{frames}.map(frame => frame.ariaLabel)") == []
 
 
 def test_tables_fit_on_a_printed_page(browser: Any, home: Path) -> None:

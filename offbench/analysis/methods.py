@@ -1,0 +1,144 @@
+"""Methods: an algorithm with its settings, and the one name that tables, figures and the command line have for it."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from offbench.common.errors import OffbenchError, nearest, unknown
+from offbench.training.registry import FORMER_SETTINGS, algorithm_names
+from offbench.training.run import RunConfig
+from offbench.training.spec import folder_name
+
+METHOD_ORDER = ("td3_bc", "cql", "bdb")  # of the BDB paper's Table 1
+OURS = FORMER_SETTINGS["bdb"].keys()  # settings that make an earlier version's BDB another method than the paper's
+
+
+@dataclass(frozen=True)
+class Method:
+    """An algorithm with its settings.
+
+    Attributes:
+        beta: the value of a setting of that name, as the published tables' columns have it.
+        name: a name given to it (a grid's `label`), or one without the settings that all variants here share.
+    """
+
+    algorithm: str
+    variant: str
+    beta: str | None = None
+    name: str = ""
+
+    @property
+    def label(self) -> str:
+        """The name in tables, figures and on the command line: `td3_bc`, `bdb (adaptive)`, `bdb (beta=0.25)`."""
+        return self.name or self.named()
+
+    @property
+    def settings(self) -> list[str]:
+        """Beta, then the settings that differ from their defaults: `["adaptive", "hidden=8x8"]`."""
+        parts = [] if self.variant == "default" else self.variant.split(",")
+        beta = [part for part in parts if part.startswith("beta=")]
+        rest = [part for part in parts if not part.startswith("beta=")]
+        if not beta and self.beta is not None:
+            beta = [f"beta={self.beta}"]
+        words = (part.partition("=")[2] for part in beta)
+        return [word if word.isalpha() else f"beta={word}" for word in words] + rest
+
+    def named(self, without: Collection[str] = ()) -> str:
+        """Return algorithm and settings as one name, some settings left out."""
+        parts = [part for part in self.settings if part not in without]
+        return f"{self.algorithm} ({', '.join(parts)})" if parts else self.algorithm
+
+    @property
+    def spellings(self) -> set[str]:
+        """Every way to write this method as an argument."""
+        beta = [] if self.beta is None or "beta=" in self.variant else [f"beta={self.beta}"]
+        whole = ",".join([*beta, *([] if self.variant == "default" else [self.variant])])
+        variants = {self.variant, folder_name(self.variant), whole, whole.removeprefix("beta=")} - {""}
+        names = {f"{self.algorithm}{by}{variant}" for variant in variants for by in ("/", " ")}
+        return names | {self.label, self.named()}
+
+    @property
+    def published(self) -> str:
+        """The method's name in published/scores.csv; empty for what no paper has."""
+        if {part.partition("=")[0] for part in self.variant.split(",")} & OURS:
+            return ""
+        return self.algorithm if self.beta is None else f"{self.algorithm} beta={self.beta}"
+
+
+def name_methods(configs: Mapping[tuple[str, str], Sequence[RunConfig]]) -> dict[tuple[str, str], Method]:
+    """Return the method of each (algorithm, variant), named so that no two have the same name.
+
+    A name is the label that all its runs have (`label` of a grid's entry), or the algorithm with beta and the settings
+    that tell its variants apart here: what they share is left out, except settings that make another method of it.
+
+    Args:
+        configs: the config.json of every run of each method.
+    """
+    plain = {key: Method(*key, _beta(found[0].settings.get("beta"))) for key, found in configs.items()}
+    names = {}
+    for key, method in plain.items():
+        labels = {config.label for config in configs[key]}
+        given = labels.pop() if len(labels) == 1 else None
+        siblings = [set(other.settings) for other in plain.values() if other.algorithm == method.algorithm]
+        shared = {part for part in set.intersection(*siblings) if "=" in part}
+        shared = {part for part in shared if part.partition("=")[0] not in {*OURS, "beta"}}
+        names[key] = given or method.named(shared)
+    taken = Counter(names.values())
+    return {
+        key: dataclasses.replace(method, name=names[key] if taken[names[key]] == 1 else method.named())
+        for key, method in plain.items()
+    }
+
+
+def unnamed_settings(methods: Iterable[Method]) -> list[str]:
+    """Return a note for each method with settings that its name leaves out: `cql: bc_steps=120`."""
+    notes = []
+    for method in methods:
+        shown = method.settings if method.label == method.named() else re.split(r"[(), ]+", method.label)
+        if left_out := [part for part in method.settings if part not in shown]:
+            notes.append(f"{method.label}: {', '.join(left_out)}")
+    return notes
+
+
+def find_method(methods: Sequence[Method], name: str) -> Method:
+    """Return the method of a name. See `Results.method`."""
+    name = re.sub(r" \([\d,]+( of [\d,]+)? steps\)$", "", " ".join(name.split()))  # as a column's heading has it
+    for matches in ([m for m in methods if m.label == name], [m for m in methods if name in m.spellings]):
+        if len(matches) == 1:
+            return matches[0]
+    algorithm = re.split(r"[/ ]", name)[0]
+    variants = [method for method in methods if method.algorithm == algorithm]
+    labels = ", ".join(f"'{method.label}'" for method in variants or methods)
+    if not variants:
+        if algorithm in algorithm_names():
+            raise OffbenchError(f"{algorithm} has no evaluated runs here; there are {labels}")
+        raise unknown("method", name, [method.label for method in methods])
+    if name == algorithm:
+        default = variants if len(variants) == 1 else [method for method in variants if method.variant == "default"]
+        if len(default) == 1:
+            return default[0]
+        raise OffbenchError(f"{algorithm} has several variants: give one of {labels}")
+    near = nearest(name, [method.label for method in variants])
+    hint = f"did you mean '{near}'?" if near else f"there are {labels}"
+    raise OffbenchError(f"no method {name!r} here: {hint}")
+
+
+def _beta(value: Any) -> str | None:
+    if isinstance(value, int | float) and abs(value) < 1e6:
+        return f"{value:.2f}"
+    return None if value is None else str(value)  # what a damaged config.json or another's algorithm has there
+
+
+def rank(name: str, order: Sequence[str]) -> tuple[int, str]:
+    """Return what sorts a name by its place in an order, those outside it last and by name."""
+    return (order.index(name) if name in order else len(order), name)
+
+
+def method_order(method: Method) -> tuple[Any, ...]:
+    """Return what sorts methods as the paper's table has them: fixed betas in order, then the words (adaptive)."""
+    return rank(method.algorithm, METHOD_ORDER), method.beta or "", len(method.variant), method.variant

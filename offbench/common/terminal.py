@@ -1,0 +1,135 @@
+"""What a person reads: tables, hints and errors, in color on a terminal and as plain text in a pipe or a file.
+
+rich is imported only to write to a terminal, so that a short command stays fast. NO_COLOR and TERM=dumb are respected.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shlex
+import sys
+import textwrap
+from collections.abc import Collection, Sequence
+from typing import Any, TextIO
+
+from offbench.common.text import aligned, printable
+
+NARROW, NARROWEST = 28, 12  # widths of a column of names
+
+
+def is_terminal(stream: TextIO | None) -> bool:
+    """Return whether a person reads this stream now."""
+    return stream is not None and stream.isatty()
+
+
+def console(stream: TextIO) -> Any:
+    """Return rich's console of a stream. Text of files must pass `printable` first: rich writes escape sequences."""
+    from rich.console import Console
+
+    raw = getattr(stream, "raw_stream", stream)
+    plain = bool(os.environ.get("NO_COLOR"))  # rich itself would still print bold
+    return Console(file=raw, color_system=None if plain else "auto", highlight=False, markup=False, emoji=False)
+
+
+def say(line: str, style: str = "", *, stream: TextIO | None = None) -> None:
+    """Print a line to stdout (or another stream), styled on a terminal."""
+    stream = stream or sys.stdout
+    if is_terminal(stream):
+        console(stream).print(printable(line), style=style or None)
+    else:
+        print(line, file=stream, flush=True)
+
+
+def labelled(label: str, text: str, style: str) -> None:
+    """Print `label: text` to stderr, the label styled on a terminal."""
+    if is_terminal(sys.stderr):
+        from rich.text import Text
+
+        console(sys.stderr).print(Text.assemble((f"{label}:", style), " ", printable(text)), soft_wrap=True)
+    else:
+        print(f"{label}: {text}", file=sys.stderr, flush=True)
+
+
+def hint(*words: str) -> None:
+    """Print the command to run next to stderr, quoted so that it can be pasted."""
+    labelled("next", shlex.join(words), "bold green")
+
+
+def note(text: str) -> None:
+    """Print something worth knowing to stderr."""
+    labelled("note", text, "bold cyan")
+
+
+def print_table(
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    names: int = 1,
+    group: bool = False,
+    optional: Sequence[str] = (),
+    marked: Collection[tuple[int, int]] = (),
+) -> None:
+    """Print a table to stdout.
+
+    In a pipe it is aligned text, one line a row and nothing left out. On a terminal it is as wide as the terminal:
+    long names wrap.
+
+    Args:
+        names: how many leading columns are text; the others are aligned to the right.
+        group: on a terminal, rows with the same first cell stand below a heading with it.
+        optional: columns to leave out on a terminal that is too narrow, the first one first.
+        marked: (row, column) of cells in bold.
+    """
+    if not is_terminal(sys.stdout):
+        print("\n".join(aligned(header, rows, names)))
+        return
+    screen = console(sys.stdout)
+    indent = 2 if group else 0
+    shown = list(range(1 if group else 0, len(header)))
+    widths = [max(len(line[column]) for line in [header, *rows]) for column in range(len(header))]
+
+    def missing() -> int:
+        return sum(widths[column] + 2 for column in shown) - 2 + indent - int(screen.width)
+
+    def narrow(least: int) -> None:
+        texts = [column for column in shown if column < names]
+        while missing() > 0 and max(widths[column] for column in texts) > least:  # the widest name gives way first
+            widths[max(texts, key=widths.__getitem__)] -= 1
+
+    narrow(NARROW)
+    for title in optional:
+        if missing() > 0:
+            shown = [column for column in shown if header[column] != title]
+    narrow(NARROWEST)
+    layout = [(column, widths[column], column < names) for column in shown]
+    for line in _lines(header, layout):
+        screen.print(_indented(line, indent), style="bold", soft_wrap=True)
+    for i, row in enumerate(rows):
+        if group and (i == 0 or row[0] != rows[i - 1][0]):
+            screen.print(printable(row[0]), style="cyan", soft_wrap=True)
+        bold = {column for line, column in marked if line == i}
+        for line in _lines(row, layout, bold):
+            screen.print(_indented(line, indent), soft_wrap=True)
+
+
+def _indented(line: Any, by: int) -> Any:
+    from rich.text import Text
+
+    return Text(" " * by) + line
+
+
+def _lines(row: Sequence[str], layout: Sequence[tuple[int, int, bool]], bold: Collection[int] = ()) -> list[Any]:
+    """Return a row as the lines that it takes, its long names wrapped."""
+    from rich.text import Text
+
+    wrapped = [textwrap.wrap(printable(row[column]), width) or [""] for column, width, _ in layout]
+    lines = []
+    for parts in itertools.zip_longest(*wrapped, fillvalue=""):
+        line = Text()
+        for part, (column, width, left) in zip(parts, layout, strict=True):
+            line.append("  " if line else "")
+            line.append(f"{part:{'<' if left else '>'}{width}}", "bold" if column in bold else "")
+        line.rstrip()
+        lines.append(line)
+    return lines

@@ -1,0 +1,40 @@
+"""The report's view of a sweep: the best variant of each algorithm on each dataset."""
+
+from __future__ import annotations
+
+from offbench.analysis.results import Results
+from offbench.common.scores import mean_std
+from offbench.common.tables import Cell, Table
+from offbench.reports.tables import NONE, plus_minus, row_name
+
+
+def best_table(results: Results) -> Table | None:
+    """Return the best variant of each algorithm with several, a row a dataset; None if each has a single one.
+
+    Only scores of evaluations at the same steps are ranked.
+    """
+    variants: dict[str, int] = {}
+    for method in results.methods:
+        variants[method.algorithm] = variants.get(method.algorithm, 0) + 1
+    algorithms = [name for name, count in variants.items() if count > 1]
+    rows = []
+    for task in results.tasks:
+        cells = []
+        for algorithm in algorithms:
+            entries = [e for e in results.entries.values() if e.task == task and e.method.algorithm == algorithm]
+            if not entries or len({entry.window for entry in entries}) > 1 or entries[0].window is None:
+                cells.append(NONE)
+                continue
+            best = max(entries, key=lambda entry: mean_std(entry.scores)[0])
+            mean = mean_std(best.scores)
+            of = f"best of {len(entries)}"
+            cells.append(Cell(plus_minus(mean), mean[0], more=f"{best.method.label}, {of}"))
+        if any(cell is not NONE for cell in cells):
+            rows.append([*row_name(results, task), *cells])
+    if not rows:
+        return None
+    notes = [
+        "The variant with the highest mean score. It was chosen by the score that is shown, so this number is "
+        "optimistic, the more so the more variants there are: to report it, train the chosen variant with new seeds."
+    ]
+    return Table("best", "Best variant of each algorithm", ["level", "environment", *algorithms], rows, notes, heads=2)

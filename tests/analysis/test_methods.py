@@ -1,0 +1,64 @@
+"""One name for each method: what tables print, arguments accept."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from offbench.analysis.methods import Method, find_method, name_methods, unnamed_settings
+from offbench.common.errors import OffbenchError
+from offbench.training.run import RunConfig
+
+
+def named(*methods: tuple[str, str, object], labels: tuple[str, ...] = ()) -> list[Method]:
+    """Return the methods of (algorithm, variant, beta)."""
+    texts = [*labels, *[""] * len(methods)]
+    common: dict[str, Any] = {"dataset": "x-v0", "dataset_sha256": "", "seed": 0, "steps": 1, "references": {}}
+    configs = {
+        (algorithm, variant): [
+            RunConfig(algorithm=algorithm, variant=variant, settings={"beta": beta}, label=label, **common)
+        ]
+        for (algorithm, variant, beta), label in zip(methods, texts, strict=False)
+    }
+    return list(name_methods(configs).values())
+
+
+def test_names_have_what_tells_variants_apart() -> None:
+    methods = named(
+        ("td3_bc", "default", None),
+        ("cql", "bc_steps=120,eval_samples=10", None),
+        ("bdb", "hidden=8x8,beta=0.25", 0.25),
+        ("bdb", "hidden=8x8", "adaptive"),
+    )
+    assert [method.label for method in methods] == ["td3_bc", "cql", "bdb (beta=0.25)", "bdb (adaptive)"]
+    assert unnamed_settings(methods) == [
+        "cql: bc_steps=120, eval_samples=10",
+        "bdb (beta=0.25): hidden=8x8",
+        "bdb (adaptive): hidden=8x8",
+    ]
+    methods = named(("bdb", "hidden=8x8", "adaptive"), ("bdb", "default", "adaptive"))
+    assert [method.label for method in methods] == ["bdb (adaptive, hidden=8x8)", "bdb (adaptive)"]
+    assert unnamed_settings(methods) == []
+    # a setting that makes another method of it stays, even where nothing else is there
+    (method,) = named(("bdb", "beta_max=0.5", "adaptive"))
+    assert method.label == "bdb (adaptive, beta_max=0.5)"
+
+
+def test_a_label_is_the_name_unless_two_methods_have_it() -> None:
+    one, other = named(("cql", "bc_steps=1", None), ("td3_bc", "default", None), labels=("short CQL",))
+    assert (one.label, other.label) == ("short CQL", "td3_bc")
+    assert unnamed_settings([one, other]) == ["short CQL: bc_steps=1"]
+    assert find_method([one, other], "short CQL") == one
+    one, other = named(("cql", "bc_steps=1", None), ("td3_bc", "default", None), labels=("td3_bc",))
+    assert (one.label, other.label) == ("cql (bc_steps=1)", "td3_bc")
+
+
+def test_every_spelling_is_found() -> None:
+    methods = named(("td3_bc", "default", None), ("bdb", "beta=0.5", 0.5), ("bdb", "default", "adaptive"))
+    for method in methods:
+        for name in method.spellings | {f"{method.label} (30,000 steps)", f"{method.label} (10 of 30,000 steps)"}:
+            assert find_method(methods, name) == method
+    assert find_method(methods, "bdb").variant == "default"
+    with pytest.raises(OffbenchError, match=r"no method 'bdb/beta=0.51' here: did you mean 'bdb \(beta=0.5\)'"):
+        find_method(methods, "bdb/beta=0.51")

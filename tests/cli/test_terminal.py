@@ -1,0 +1,121 @@
+"""The command line on a terminal of each width, in a pipe, and without color."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Callable
+from fcntl import ioctl
+from pathlib import Path
+
+import pytest
+
+from offbench.cli.main import BY_NAME, COMMANDS, main
+from tests.made_runs import made_grid, made_run
+
+COLOR = re.compile(r"\x1b\[[0-9;]*m")
+
+
+@pytest.fixture
+def screen(home: Path) -> Callable[..., str]:
+    """Run a command in a terminal of some columns; return all that it writes."""
+
+    def run(columns: int, *words: str, **environment: str) -> str:
+        ours, theirs = pty.openpty()
+        ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 50, columns, 0, 0))
+        env = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "LINES", "NO_COLOR")}
+        command = [sys.executable, "-m", "offbench", *words]
+        env |= {"TERM": "xterm-256color"} | environment
+        process = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, cwd=home, env=env)
+        os.close(theirs)
+        parts = []
+        while True:
+            try:
+                part = os.read(ours, 65536)
+            except OSError:  # the other end is closed
+                break
+            if not part:
+                break
+            parts.append(part)
+        os.close(ours)
+        assert process.wait() in (0, 2)
+        return b"".join(parts).decode().replace("\r\n", "\n")
+
+    return run
+
+
+@pytest.mark.parametrize("columns", [60, 80, 100, 120])
+def test_the_score_table_fits(screen: Callable[..., str], home: Path, columns: int) -> None:
+    made_grid(home / "runs", envs=("halfcheetah",), seeds=2, levels=4)
+    for seed in range(2):
+        made_run(home / "runs", "halfcheetah-medium-v0", "bc", "default", seed, 20, reached=10_000)
+    text = screen(columns, "normalize")
+    assert COLOR.search(text)
+    plain = COLOR.sub("", text)
+    assert max(map(len, plain.splitlines())) <= columns
+    for cell in ("halfcheetah-medium-expert-v0", "bdb (adaptive)", "30k", "10k of 30k", "score"):
+        assert cell in plain
+    assert ("evals" in plain) == (columns > 60)  # what gives way first
+
+
+def test_no_color_where_it_is_not_wanted(screen: Callable[..., str], home: Path) -> None:
+    for words in (["--help"], ["train", "--help"], ["list"], ["show", "nothing-v0"]):
+        assert COLOR.search(screen(80, *words)), words
+        assert not COLOR.search(screen(80, *words, NO_COLOR="1")), words
+
+
+def test_a_pipe_gets_whole_lines(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made_grid(home / "runs", envs=("halfcheetah",), seeds=2, levels=4)
+    main(["normalize"])
+    lines = capsys.readouterr().out.splitlines()
+    assert not COLOR.search("".join(lines))
+    (line,) = [line for line in lines if line.startswith("halfcheetah-medium-expert-v0  cql")]
+    assert re.search(r"  3,000  ", line)
+
+
+def test_every_command_has_an_example_that_parses(capsys: pytest.CaptureFixture[str]) -> None:
+    import shlex
+
+    from offbench.cli.main import _parser
+
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80
+    assert [title for title in COMMANDS if f"\n{title}:\n" in text] == ["Data", "Train", "Results", "Tools"]
+    for name, command in BY_NAME.items():
+        assert f"\n  {name} " in text
+        assert command.examples
+        for example in command.examples:
+            words = shlex.split(example.partition(" > ")[0])
+            assert vars(_parser(words).parse_args(words))["command"] == name
+
+
+def test_settings_are_grouped(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", "bdb_plus", "--help"])
+    text = capsys.readouterr().out
+    method, optimization, ours = (
+        text.index(title)
+        for title in ("settings of bdb_plus:", "optimization of bdb_plus:", "extensions that are not in the paper:")
+    )
+    assert method < text.index("  --beta ") < optimization < text.index("  --tau ") < ours
+    assert ours < text.index("  --beta-max ")
+
+
+def test_the_adaptive_beta_is_explained_and_the_next_command_can_be_pasted(
+    medium: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--steps", "2", "--eval-every", "2", "--eval-episodes", "1", "--workers", "1", "--hidden", "8"]
+    for algorithm, notes in (("bdb", 1), ("bdb (beta=0.5)", 0), ("td3_bc", 0)):
+        main(["train", algorithm, "--dataset", medium, *words, "--runs", "my runs"])
+        out, err = capsys.readouterr()
+        assert err.count("note: the adaptive beta starts near 1") == notes
+        assert err.splitlines()[-1] == "next: offbench normalize --runs 'my runs'"
+        assert len(out.splitlines()) == 1
+    assert "beta=0.5" in "".join(str(path) for path in Path("my runs").rglob("seed-0"))

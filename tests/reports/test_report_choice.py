@@ -1,0 +1,86 @@
+"""Which runs a report shows: several folders, some datasets and methods; and what it says of a sweep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import offbench
+from offbench.cli.main import main
+from offbench.common.errors import OffbenchError
+from tests.made_runs import METHODS, made_grid, made_run
+from tests.pages import Page, rows
+
+
+def scored(
+    root: Path, algorithm: str, variant: str, value: float, seeds: int = 2, dataset: str = "x-medium-v0"
+) -> None:
+    """Write runs whose every return, and so every score, is `value`."""
+    for seed in range(seeds):
+        run = made_run(root, dataset, algorithm, variant, seed, 0)
+        run.write_evaluations({30_000: [(value + seed, 5)] * 3})
+
+
+def test_a_title_some_datasets_and_some_methods(home: Path) -> None:
+    for dataset in ("x-medium-v0", "x-expert-v0", "y-medium-v0"):
+        for algorithm in ("td3_bc", "cql"):
+            scored(home / "runs", algorithm, "default", 50, dataset=dataset)
+        scored(home / "runs", "bdb", "beta=0.5", 50, dataset=dataset)
+    words = ["--datasets", "x-*", "--methods", "td3_bc", "bdb (beta=0.5)", "--title", "Only <x>"]
+    main(["report", "--out", "out", *words])
+    page = Page(home / "out" / "index.html")
+    assert "Only <x>" in page.text
+    table = rows(home / "out" / "tables" / "scores.csv")
+    assert [row["level"] for row in table] == ["medium", "expert"]
+    assert list(table[0])[2:] == ["td3_bc (30,000 steps)", "bdb (beta=0.5) (30,000 steps)"]
+    assert "cql" not in page.text
+    with pytest.raises(OffbenchError, match="unknown dataset 'z-\\*': known: x-expert-v0"):
+        offbench.report("runs", "out", datasets=["z-*"])
+    with pytest.raises(OffbenchError, match="bc has no evaluated runs here"):
+        offbench.report("runs", "out", methods=["bc"])
+
+
+def test_several_folders_are_one_report(home: Path) -> None:
+    scored(home / "mine", "td3_bc", "default", 50)
+    scored(home / "theirs", "cql", "default", 60)
+    page = Page(offbench.report(["mine", "theirs", "mine"], "out"))
+    ((row),) = rows(home / "out" / "tables" / "scores.csv")
+    assert [row[f"{name} (30,000 steps)"] for name in ("td3_bc", "cql")] == ["50.5 ± 0.7", "60.5 ± 0.7"]
+    assert "mine/x-medium-v0/td3_bc/default/seed-0" in page.text
+    assert "theirs/x-medium-v0/cql/default/seed-1" in page.text
+
+
+def test_the_best_variant_of_a_sweep(home: Path) -> None:
+    for variant, value in {"alpha=1": 40.0, "alpha=2": 70.0, "alpha=3": 50.0}.items():
+        scored(home / "runs", "td3_bc", variant, value)
+    scored(home / "runs", "cql", "default", 60)
+    page = Page(offbench.report("runs", "out"))
+    ((row),) = rows(home / "out" / "tables" / "best.csv")
+    assert row["td3_bc"] == "70.5 ± 0.7 (td3_bc (alpha=2), best of 3)"
+    assert "cql" not in row
+    assert "optimistic" in page.text
+    # scores of evaluations at other steps are not ranked
+    run = made_run(home / "runs", "x-medium-v0", "td3_bc", "alpha=4", 0, 0)
+    run.write_evaluations({10_000: [(99.0, 5)] * 3})
+    offbench.report("runs", "out")
+    assert not (home / "out" / "tables" / "best.csv").exists()
+
+
+def test_the_papers_names_are_for_the_papers_grid(home: Path) -> None:
+    made_grid(home / "runs", seeds=2, levels=1)
+    page = Page(offbench.report("runs", "out"))
+    assert "Scores (the BDB paper's Table 1)" in page.text
+    assert "Similar score (the BDB paper's Table 2)" in page.text
+    labels = ["td3_bc", "cql", "bdb (beta=0.25)", "bdb (beta=0.5)"]
+    page = Page(offbench.report("runs", "out", methods=labels))
+    assert len(labels) < len(METHODS)
+    assert "paper's Table" not in page.text
+    assert "paper's Figure" not in page.text
+    assert "“paper”: BDB paper, Table 1" in page.text  # its numbers stay
+
+
+def test_settings_that_names_leave_out_are_said(home: Path) -> None:
+    scored(home / "runs", "cql", "bc_steps=120,eval_samples=10", 50)
+    page = Page(offbench.report("runs", "out"))
+    assert "Settings that differ from the defaults: cql: bc_steps=120, eval_samples=10." in page.text
