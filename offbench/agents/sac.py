@@ -34,7 +34,15 @@ from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common import checkpoints, seeds
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import csv_bytes, disk_errors, read_json, remove_leftovers, sole, write_bytes, write_json
+from offbench.common.files import (
+    csv_bytes,
+    disk_errors,
+    exclusive_lock,
+    read_json,
+    remove_leftovers,
+    write_bytes,
+    write_json,
+)
 from offbench.common.processes import stops_noted
 from offbench.common.progress import Progress, duration
 from offbench.common.provenance import hardware, versions
@@ -59,7 +67,7 @@ def train(folder: TrainingFolder, steps: int) -> None:
         OffbenchError: the folder belongs to another recipe or seed, is in use, or the disk refuses.
         KeyboardInterrupt: after Ctrl-C (or whatever SIGTERM raises), once a checkpoint is written.
     """
-    with sole(folder.path / ".lock", f"{folder.path} is being trained"):
+    with exclusive_lock(folder.path / ".lock", f"{folder.path} is being trained"):
         remove_leftovers(folder.path)
         _check_identity(folder)
         if max(checkpoints.steps(folder.path), default=0) < steps:

@@ -4,9 +4,9 @@ datasets = ["hopper-medium-v0", {id = "mine-v0", env = "./my-env.toml", level = 
 seeds = 5                          # that many, or a list
 steps = 1_000_000                  # with eval_every and eval_episodes as in `offbench train`
 [[algorithms]]
-name = "bdb"                       # then its settings; a list is a variant for each value (hidden: a list of lists)
+name = "bdb"                       # then its settings; a list makes a variant per value (hidden: a list of lists)
 beta = [0.25, "adaptive"]
-steps = 500_000                    # seeds, steps, eval_every and eval_episodes of its own, if need be
+steps = 500_000                    # optional: its own seeds, steps, eval_every and eval_episodes
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from offbench.data.levels import parse_level
 from offbench.envs.recipes import load_recipe
 from offbench.training.spec import Times
 
-MOST_SEEDS = 100_000  # beyond this a count is a slip, and would fill the memory
+MOST_SEEDS = 100_000  # a larger count is a typing error, and would fill the memory
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Source:
     """A dataset of a grid, and how it is recorded if it is missing.
 
     Attributes:
-        env: a recipe's name or file (from the grid's folder if there is one, else from the current one); empty for a
-            dataset that offbench cannot record.
+        env: a recipe's name or file (relative to the grid's folder if it exists there, else to the current one);
+            empty for a dataset that offbench cannot record.
     """
 
     id: str
@@ -48,7 +48,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Entry:
-    """An algorithm of a grid with its settings (lists are varied) and its times."""
+    """An algorithm of a grid with its settings (each value of a list is a variant) and its times."""
 
     algorithm: str
     settings: Mapping[str, Any]
@@ -75,7 +75,7 @@ def shipped_grids() -> list[str]:
 
 
 def load_grid(name: str) -> Grid:
-    """Return a shipped grid by name (`paper-small`) or anybody's by path (`./mine.toml`).
+    """Return a shipped grid by name (`paper-small`) or a grid file by path (`./mine.toml`).
 
     Raises:
         OffbenchError: no such grid, not TOML, an unknown key, a wrong type or value.
@@ -86,10 +86,10 @@ def load_grid(name: str) -> Grid:
         raise unknown("grid", name, shipped_grids())
     where = f"{path.name}"
     try:
-        with damage(where, "is not a readable TOML file", "correct it, or name another"):
+        with damage(where, "is not a readable TOML file", "correct it, or give another"):
             values = tomllib.loads(read_text(path))
     except FileNotFoundError:
-        raise OffbenchError(f"no grid file {path}; shipped are {', '.join(shipped_grids())}") from None
+        raise OffbenchError(f"no grid file {path}; shipped grids: {', '.join(shipped_grids())}") from None
     sources = _list(values.pop("datasets", []), "datasets", where)
     entries = _list(values.pop("algorithms", []), "algorithms", where)
     times = _times(values, Times(), where)
@@ -107,15 +107,15 @@ def _list(value: Any, key: str, where: str) -> list[Any]:
 
 
 def _times(values: dict[str, Any], default: Times, where: str) -> Times:
-    """Return `default` with what `values` says otherwise."""
-    whole = dataclasses.asdict(default) | values
-    seeds = whole.pop("seeds")
+    """Return `default` with the changes in `values`."""
+    merged = dataclasses.asdict(default) | values
+    seeds = merged.pop("seeds")
     if isinstance(seeds, int) and not isinstance(seeds, bool) and 0 < seeds <= MOST_SEEDS:
         seeds = range(seeds)
     bad = not isinstance(seeds, Sequence) or any(type(s) is not int or s < 0 for s in seeds)
     if bad or len(set(seeds)) != len(seeds) or not len(seeds):
         raise OffbenchError(f"{where}: seeds must be a count or a list of different whole numbers, not {seeds!r}")
-    return build(Times, whole | {"seeds": tuple(seeds)}, where)
+    return build(Times, merged | {"seeds": tuple(seeds)}, where)
 
 
 def _source(value: Any, folder: Path, where: str) -> Source:
@@ -131,7 +131,7 @@ def _source(value: Any, folder: Path, where: str) -> Source:
         raise OffbenchError(f"{where}: datasets must be ids or tables, not {value!r}")
     env, level = minari_store.recorded_by(minari_store.check_id(value))
     if env and value.rpartition("-v")[2] != str(load_recipe(env).version):
-        return Source(value)  # another version's, such as one of D4RL's: known if it is here, never recorded
+        return Source(value)  # of another version, such as one of D4RL's: it can be used but not recorded
     return Source(value, env, level)
 
 

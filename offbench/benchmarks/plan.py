@@ -148,10 +148,7 @@ class Plan:
         machine = self.bench.machine
         cpu = machine.device == "cpu"
         where = f"{machine.processes} processes of one thread" if cpu else machine.device
-        yield (
-            f"  on {where} about {duration(self._seconds)}, {self._disk / 1e9:.1f} GB of disk "
-            "(measured for a moment, just now)"
-        )
+        yield (f"  on {where} about {duration(self._seconds)}, {self._disk / 1e9:.1f} GB of disk (measured just now)")
         if cpu:
             yield (
                 f"  on a GPU: not measured here; {self._products:.2g} operations in matrix products, which take "
@@ -173,13 +170,13 @@ def _recipe(source: Source) -> Recipe:
 def _recorded_env_spec(source: Source) -> str:
     spec = evaluation_spec(minari_store.read_metadata(source.id))
     if spec is None:
-        raise OffbenchError(f"{source.id} names no environment to plan by; give its env in the grid")
+        raise OffbenchError(f"{source.id} names no environment; give its env in the grid")
     believed_env(spec, source.id).close()
     return spec
 
 
 def _size(source: Source) -> int:
-    """Return the transitions of a dataset that is to be recorded, about."""
+    """Return about how many transitions a dataset to be recorded will have."""
     if source.steps or not source.env:
         return source.steps or 0
     _, parts = parse_level(source.level)

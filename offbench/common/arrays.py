@@ -14,8 +14,8 @@ Array = npt.NDArray[Any]
 
 
 def content_sha256(arrays: Mapping[str, Array], state: Mapping[str, Any]) -> str:
-    """Return a hash over named arrays and the JSON beside them, so that a flipped bit is no other number."""
-    plain = json.loads(json.dumps(state))  # as it will be read: tuples are lists, keys are text
+    """Return the SHA-256 of named arrays and of a JSON state, which detects any changed bit."""
+    plain = json.loads(json.dumps(state))  # as it will be read back: tuples as lists, keys as text
     content = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
     for name in sorted(arrays):
         content.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}".encode())

@@ -1,4 +1,4 @@
-"""Checkpoints: safetensors with a JSON state beside the tensors, the newest two kept, nothing ever unpickled."""
+"""Checkpoints: safetensors files of tensors and a JSON state, of which the newest two are kept."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ State = dict[str, Any]
 
 def save_checkpoint(folder: Path, step: int, tensors: dict[str, torch.Tensor], state: State) -> None:
     """Write checkpoint-<step>.safetensors, whole or not at all."""
-    whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    saved = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     # one key, because safetensors writes several in any order, and a run's bytes should depend on the run alone
-    about = {**state, "sha256": _sha256(whole, state)}
-    data = save(whole, metadata={"offbench": json.dumps(about, sort_keys=True)})
+    header = {**state, "sha256": _sha256(saved, state)}
+    data = save(saved, metadata={"offbench": json.dumps(header, sort_keys=True)})
     write_bytes(folder / f"checkpoint-{step:09d}.safetensors", data)
 
 
 def steps(folder: Path) -> list[int]:
     """Return the steps that have a checkpoint in `folder`, newest first."""
-    found = (_NAME.fullmatch(path.name) for path in folder.glob("checkpoint-*.safetensors"))
-    return sorted((int(match[1]) for match in found if match), reverse=True)
+    matches = (_NAME.fullmatch(path.name) for path in folder.glob("checkpoint-*.safetensors"))
+    return sorted((int(match[1]) for match in matches if match), reverse=True)
 
 
 def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], State] | None:
@@ -52,10 +52,10 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], S
                 state = json.loads((file.metadata() or {})["offbench"])
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             if not isinstance(state, dict) or state.get("step") != step:
-                raise ValueError(f"it is not of step {step}")
+                raise ValueError(f"it does not hold step {step}")
             recorded = state.pop("sha256", None)  # older files have none
             if recorded is not None and recorded != _sha256(tensors, state):
-                raise ValueError("its content is not what was written (SHA-256)")
+                raise ValueError("its SHA-256 does not match its content")
             return tensors, state
     except (DamagedError, FileNotFoundError) as error:
         print(f"offbench: {error}", file=sys.stderr)
@@ -67,8 +67,8 @@ def _sha256(tensors: dict[str, torch.Tensor], state: State) -> str:
 
 
 def load_newest(folder: Path) -> tuple[dict[str, torch.Tensor], State] | None:
-    """Read the newest checkpoint that is whole, or return None."""
-    return next((found for step in steps(folder) if (found := load_checkpoint(folder, step))), None)
+    """Read the newest checkpoint that is not damaged, or return None."""
+    return next((checkpoint for step in steps(folder) if (checkpoint := load_checkpoint(folder, step))), None)
 
 
 def keep_newest(folder: Path) -> None:

@@ -7,32 +7,32 @@ import os
 import re
 from collections.abc import Iterable
 
-NEAR = 0.76  # of two names' likeness: more than iql and cql, less than hoper and hopper
+NEAR = 0.76  # similarity of two names (difflib): more than iql and cql, less than hoper and hopper
 DRAWING = ("MUJOCO_GL", "PYOPENGL_PLATFORM")  # environment variables that MuJoCo and PyOpenGL read when they load
 SHOW_TRACEBACK = "OFFBENCH_TRACEBACK=1 shows the traceback"
 
 
 class OffbenchError(Exception):
-    """A problem the user can mend. The CLI prints its text as one line and exits with code 2."""
+    """A problem that the user can fix. The CLI prints its text as one line and exits with code 2."""
 
 
 class DamagedError(OffbenchError):
     """The content of a file is at fault, rather than the disk, a lock or a permission."""
 
 
-def nearest(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name that `name` is a slip of the pen or a part of; None if none is that near."""
-    names = sorted(known)
-    near = difflib.get_close_matches(name, names, n=1, cutoff=NEAR)
-    parts = [one for one in names if len(name) >= 3 and name in one]
-    return next(iter(near + parts), None)
+def nearest(name: str, valid: Iterable[str]) -> str | None:
+    """Return the valid name that `name` is a typing error or a part of, or None."""
+    names = sorted(valid)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=NEAR)
+    containing = [candidate for candidate in names if len(name) >= 3 and name in candidate]
+    return next(iter(close + containing), None)
 
 
-def unknown(what: str, name: str, known: Iterable[str]) -> OffbenchError:
-    """Return the error for a `name` that is not among the `known` ones, with a near one suggested."""
-    names = sorted(known)
-    near = nearest(name, names)
-    hint = f"did you mean {near!r}?" if near else f"known: {', '.join(names) or 'none'}"
+def unknown(what: str, name: str, valid: Iterable[str]) -> OffbenchError:
+    """Return the error for a `name` that is not among the `valid` ones; it suggests a similar one, or lists all."""
+    names = sorted(valid)
+    suggestion = nearest(name, names)
+    hint = f"did you mean {suggestion!r}?" if suggestion else f"available: {', '.join(names) or 'none'}"
     return OffbenchError(f"unknown {what} {name!r}: {hint}")
 
 

@@ -1,4 +1,4 @@
-"""Files that are whole or absent: written aside, flushed to disk, then renamed into place."""
+"""Files that are complete or absent: written to a temporary file, flushed to disk, then renamed."""
 
 from __future__ import annotations
 
@@ -39,79 +39,80 @@ ORPHANS = 3.0  # seconds to wait for a lock: processes whose parent was killed n
 
 @contextlib.contextmanager
 def disk_errors(what: str) -> Iterator[None]:
-    """Turn the operating system's refusals (full disk, no permission) into one clear line."""
+    """Turn the operating system's errors (full disk, no permission) into one clear line."""
     try:
         yield
     except OSError as error:
         if isinstance(error, FileNotFoundError | BrokenPipeError):
             raise
-        remedy = OPEN_FILES.get(error.errno, "free some room or choose another folder")
+        remedy = OPEN_FILES.get(error.errno, "free some space or choose another folder")
         raise OffbenchError(f"cannot write {what}: {error.strerror or error}; {remedy}") from error
 
 
 @contextlib.contextmanager
-def sole(lock: Path, what: str, patience: float = ORPHANS) -> Iterator[None]:
-    """Hold a lock file for this process, so that no other does the same work.
+def exclusive_lock(path: Path, what: str, timeout: float = ORPHANS) -> Iterator[None]:
+    """Hold a lock file for this process, so that no other one does the same work.
 
     Args:
-        lock: its path, a hidden name; beside it lies who holds it, for the other process to say.
-        what: what is held and how, e.g. "hopper-medium-v0 is being recorded".
-        patience: seconds to wait for another process to let go.
+        path: the lock file, a hidden name; a file beside it says which process holds the lock.
+        what: what is locked and why, e.g. "hopper-medium-v0 is being recorded".
+        timeout: seconds to wait for another process to release the lock.
 
     Raises:
         OffbenchError: another process holds it; its process id and host are named.
     """
-    lock = lock.absolute()
-    held, holder = FileLock(lock), lock.with_suffix(".holder")
-    with disk_errors(str(lock.parent)):
-        lock.parent.mkdir(parents=True, exist_ok=True)
+    path = path.absolute()
+    lock, holder = FileLock(path), path.with_suffix(".holder")
+    with disk_errors(str(path.parent)):
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            held.acquire(timeout=patience)
+            lock.acquire(timeout=timeout)
         except Timeout:
             raise OffbenchError(f"{what} by {_holder(holder)}; wait for it, or stop it") from None
     try:
-        _held[lock] = lock.stat().st_ino  # no new file gets this number while the lock is open
-        with disk_errors(str(lock.parent)):
+        _inodes[path] = path.stat().st_ino  # no new file gets this number while the lock is open
+        with disk_errors(str(path.parent)):
             holder.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
         yield
     finally:
-        if _is_ours(lock):  # else the holder file is another process's
+        if _holds(path):  # else the holder file belongs to another process
             holder.unlink(missing_ok=True)
-        _held.pop(lock, None)
-        held.release()
+        _inodes.pop(path, None)
+        lock.release()
 
 
-_held: dict[Path, int] = {}  # the locks of this process, and their inodes
+_inodes: dict[Path, int] = {}  # of the lock files that this process holds
 
 
-def _is_ours(lock: Path) -> bool:
+def _holds(lock: Path) -> bool:
+    """Return whether this process still holds the lock file at this path."""
     try:
-        return lock.stat().st_ino == _held.get(lock)
+        return lock.stat().st_ino == _inodes.get(lock)
     except OSError:
         return False
 
 
 def check_ownership(path: Path) -> None:
-    """Check, before a write, that the locks this process holds at or above `path` are still in place.
+    """Check, before a write, that the lock files of this process at or above `path` still exist.
 
     Raises:
         OffbenchError: a folder was moved, deleted or replaced while its lock was held.
     """
     parents = path.absolute().parents
-    for lock in _held:
-        if lock.parent in parents and not _is_ours(lock):
+    for lock in _inodes:
+        if lock.parent in parents and not _holds(lock):
             raise OffbenchError(
                 f"{lock.parent} was moved, deleted or replaced while this process was writing to it; "
-                "nothing more is written: move it back and run the command again to resume, or start over"
+                "nothing more is written: move it back and rerun the command to resume, or start over"
             )
 
 
 def _holder(path: Path) -> str:
     try:
-        words = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
-        words = ""
-    return words if words.startswith("process ") and len(words) < 300 else "another process"
+        text = ""
+    return text if text.startswith("process ") and len(text) < 300 else "another process"
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -136,13 +137,13 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what killed processes left of files that they were writing in `folder`; call it under its lock."""
+    """Delete the unfinished files of killed processes in `folder`, whose lock must be held."""
     for leftover in folder.glob(".*.tmp"):
         leftover.unlink(missing_ok=True)
 
 
 def output_file(path: str | Path) -> Path:
-    """Return the path of a file that a user asks for. Raises OffbenchError if its folder is not there."""
+    """Return the path of a file to write. Raises OffbenchError if its folder does not exist."""
     path = Path(path)
     if not path.parent.is_dir():
         raise OffbenchError(f"cannot write {path}: there is no folder {path.parent}")
@@ -158,9 +159,9 @@ def read_json(path: Path) -> Any:
     """Read a JSON file. Raises OffbenchError if it is missing or damaged."""
     try:
         with damage(str(path), "is damaged or not JSON", "delete it to start over"):
-            found = json.loads(read_text(path))
-            json.dumps(found, ensure_ascii=False).encode()  # "\\ud800" is JSON, but no text to be shown or written
-            return found
+            value = json.loads(read_text(path))
+            json.dumps(value, ensure_ascii=False).encode()  # "\\ud800" is JSON, but cannot be printed or written
+            return value
     except FileNotFoundError:
         raise OffbenchError(f"no file {path}") from None
 
@@ -176,10 +177,10 @@ def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
 
 @contextlib.contextmanager
 def damage(name: str, fault: str, remedy: str) -> Iterator[None]:
-    """Turn any exception of a reader of a file from elsewhere into one line.
+    """Turn any exception of reading a file from elsewhere into one line.
 
-    The operating system's refusals (a lock, no permission, a failing disk) and missing packages are reported as such,
-    all else as damage. A missing file is left to the caller.
+    Errors of the operating system (a lock, no permission, a failing disk) and missing packages are reported as such,
+    all others as damage. A missing file is left to the caller.
 
     Args:
         name: the file, e.g. "run/config.json".
@@ -194,7 +195,7 @@ def damage(name: str, fault: str, remedy: str) -> Iterator[None]:
         yield
     except (OffbenchError, FileNotFoundError):
         raise
-    except Exception as error:  # damaged bytes cause any exception of any parser
+    except Exception as error:  # parsers raise anything for damaged bytes
         if other := _read_remedy(error):
             raise OffbenchError(f"cannot read {name}: {_reason(error)}; {other}") from error
         raise DamagedError(f"{name} {fault} ({_reason(error)}); {remedy}") from error
@@ -212,12 +213,12 @@ def _read_remedy(error: BaseException) -> str | None:
 
 
 def _reason(error: BaseException) -> str:
-    words = " ".join(str(error).split()) or type(error).__name__
-    return f"there is no {words}" if type(error) is KeyError else words
+    text = " ".join(str(error).split()) or type(error).__name__
+    return f"there is no {text}" if type(error) is KeyError else text
 
 
 def regular(path: str | Path, flags: int = os.O_RDONLY) -> int:
-    """Open a file as `open` does (it is an `opener`), but none that never ends: no FIFO, device or folder.
+    """Open a regular file (an `opener` for `open`): a FIFO or device could block or never end.
 
     Raises:
         OSError: it is not a regular file, or cannot be opened.

@@ -1,4 +1,4 @@
-"""HDF5 on a disk that may be full: libhdf5 crashes the whole process when a write fails while it closes a file."""
+"""HDF5 on a disk that may be full: libhdf5 crashes the process if a write fails while it closes a file."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 
 
 class SafeFile:
-    """A file that libhdf5 writes to without ever meeting an error.
+    """A file object for h5py whose writes never raise.
 
-    The first error is kept and everything after it is dropped; `check` raises it. Whoever writes calls `check` now
-    and then, and at the end. It has what h5py asks of a file object.
+    The first error is kept and later writes are dropped; `check` raises it. The writer calls `check` now and then, and
+    at the end.
     """
 
     def __init__(self, path: Path) -> None:
@@ -21,7 +21,7 @@ class SafeFile:
         self._error: OSError | None = None
 
     def check(self) -> None:
-        """Raise the error that a write met, if one did."""
+        """Raise the error of a failed write, if there was one."""
         if self._error is not None:
             raise self._error
 
@@ -37,7 +37,7 @@ class SafeFile:
         return len(view)
 
     def readinto(self, buffer: Any) -> int:
-        """Read; what a failed write left out is zeros."""
+        """Read; bytes that a failed write left out are zero."""
         view = memoryview(buffer).cast("B")
         count = self._file.readinto(view) or 0
         view[count:] = bytes(len(view) - count)
@@ -50,7 +50,7 @@ class SafeFile:
         return bytes(data)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move as any file does."""
+        """Set the position, as `io.IOBase.seek`."""
         return self._file.seek(offset, whence)
 
     def tell(self) -> int:
@@ -69,7 +69,7 @@ class SafeFile:
         """Do nothing: nothing is buffered."""
 
     def close(self) -> None:
-        """Close; the data are on the disk, or the error is raised."""
+        """Flush to the disk and close. Raises the error of a failed write."""
         with self._file:
             self.check()
             os.fsync(self._file.fileno())

@@ -1,4 +1,4 @@
-"""Pictures: matplotlib without a screen, written whole or not at all."""
+"""Figures: matplotlib without a screen."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def figure(panels: int = 1) -> Iterator[tuple[Any, list[Any]]]:
 
 
 def picture_file(path: str | Path) -> Path:
-    """Return the path of a picture that a user asks for. Raises OffbenchError for an unknown ending, or no folder."""
+    """Return the path of a figure to write. Raises OffbenchError for an unknown ending, or if there is no folder."""
     path = Path(path)
     if path.suffix.lstrip(".").lower() not in FORMATS:
-        raise OffbenchError(f"a picture's name must end in {', '.join('.' + f for f in FORMATS)}, not {path.name!r}")
+        raise OffbenchError(f"a figure's name must end in {', '.join('.' + f for f in FORMATS)}, not {path.name!r}")
     return output_file(path)
 
 

@@ -17,7 +17,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import OPEN_FILES
 
 STOPS = {signal.SIGINT, signal.SIGTERM}
-LAST = 2.0  # seconds that a worker has to end when its pool closes
+GRACE = 2.0  # seconds that a worker has to end when its pool closes
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -27,7 +27,7 @@ def cores() -> int:
 
 
 def default_workers(workers: int | None) -> int:
-    """Return `workers`, or one a core if it is None. Raises OffbenchError below 1."""
+    """Return `workers`, or one per core if it is None. Raises OffbenchError below 1."""
     if workers is None:
         return cores()
     if workers < 1:
@@ -37,26 +37,26 @@ def default_workers(workers: int | None) -> int:
 
 @contextlib.contextmanager
 def start_errors() -> Iterator[None]:
-    """Turn the operating system's refusals to start a process, or to share memory with it, into one line."""
+    """Turn the operating system's errors in starting a process, or in sharing memory with it, into one line."""
     try:
         yield
     except OSError as error:
         full = error.errno == errno.ENOSPC
-        remedy = OPEN_FILES.get(error.errno, "free some room in /dev/shm" if full else "use fewer --workers")
+        remedy = OPEN_FILES.get(error.errno, "free some space in /dev/shm" if full else "use fewer --workers")
         raise OffbenchError(f"cannot start a worker process: {error.strerror or error}; {remedy}") from error
 
 
 @contextlib.contextmanager
 def quiet_start() -> Iterator[None]:
-    """Let a worker start undisturbed: submitting a task may start one.
+    """Start a worker process without interruption (submitting a task may start one).
 
-    Ctrl-C and SIGTERM are held back meanwhile (half a start would leave the pool unusable), and the user's script
-    is hidden: a spawned process would run it again, and a worker needs nothing of it. A worker gets one thread for
-    its matrix products: as many threads as cores in each of as many workers made recording several times slower.
+    Ctrl-C and SIGTERM are delayed meanwhile, as half a start would leave the pool unusable. The user's script is
+    hidden, as a spawned process would run it again. A worker gets one thread for its matrix products: with a thread
+    per core in each worker, recording was several times slower.
     """
     script = sys.modules["__main__"]
     threads = {name: "1" for name in THREADS if name not in os.environ}
-    with start_errors(), _held_back():
+    with start_errors(), _stops_delayed():
         sys.modules["__main__"] = types.ModuleType("__main__")
         os.environ |= threads
         try:
@@ -68,11 +68,11 @@ def quiet_start() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _held_back() -> Iterator[None]:
-    """Hold back Ctrl-C and SIGTERM, and let them come at the end.
+def _stops_delayed() -> Iterator[None]:
+    """Delay Ctrl-C and SIGTERM until the end.
 
-    The mask is for the process that starts, which inherits it. Here it is not enough: another thread, of a library's
-    say, may take the signal, and Python's handler runs in the main thread all the same.
+    The started process inherits the signal mask. In this process the mask alone is not enough: another thread, such as
+    a library's, may take the signal, and Python's handler still runs in the main thread.
     """
     masks = hasattr(signal, "pthread_sigmask")
     with stops_noted():
@@ -86,50 +86,50 @@ def _held_back() -> Iterator[None]:
 
 @contextlib.contextmanager
 def stops_noted(second_at_once: bool = False) -> Iterator[list[int]]:
-    """Take note of Ctrl-C and SIGTERM in the list that this yields; what they do, they do at the end.
+    """Collect Ctrl-C and SIGTERM in the list that this yields, and raise the first again at the end.
 
     Args:
         second_at_once: let a second Ctrl-C raise KeyboardInterrupt without waiting for the end.
     """
-    came: list[int] = []
+    received: list[int] = []
 
     def note(number: int, frame: types.FrameType | None) -> None:
-        came.append(number)
+        received.append(number)
         if second_at_once and number == signal.SIGINT:
-            if came.count(number) > 1:
+            if received.count(number) > 1:
                 signal.default_int_handler(number, frame)
             announce_stop()
 
-    # only the main thread may set handlers; None is a handler that Python cannot put back
-    ours = STOPS if threading.current_thread() is threading.main_thread() else ()
-    known = [stop for stop in ours if signal.getsignal(stop) not in (None, signal.SIG_IGN)]
-    handlers = {stop: signal.signal(stop, note) for stop in known}
+    # only the main thread may set handlers; None is a handler that Python cannot restore
+    stops = STOPS if threading.current_thread() is threading.main_thread() else ()
+    handled = [stop for stop in stops if signal.getsignal(stop) not in (None, signal.SIG_IGN)]
+    handlers = {stop: signal.signal(stop, note) for stop in handled}
     try:
-        yield came
+        yield received
     finally:
         for stop, handler in handlers.items():
             signal.signal(stop, handler)
-        if came:
-            signal.raise_signal(came[0])
+        if received:
+            signal.raise_signal(received[0])
 
 
 def announce_stop() -> None:
-    """Tell who pressed Ctrl-C on a terminal what is being waited for."""
-    if sys.stderr.isatty():  # written past Python's buffers, which a signal handler must leave alone
+    """Tell the user who pressed Ctrl-C on a terminal what the program waits for."""
+    if sys.stderr.isatty():  # not through Python's buffers, which a signal handler must not use
         os.write(sys.stderr.fileno(), b"\noffbench: saving a checkpoint; press Ctrl-C again to stop at once\n")
 
 
-class _Here:
-    """What a worker knows of its pool."""
+class _Worker:
+    """The state of this process, if it is a worker."""
 
     closing: Any = None  # a shared number that the parent sets
 
 
 def start_worker(parent: int, closing: Any = None) -> None:
-    """Leave Ctrl-C to the parent, and end when the parent is gone (even by kill -9).
+    """Leave Ctrl-C to the parent, and end when the parent has ended (even by kill -9).
 
     Args:
-        closing: a shared number; when it is not 0, nothing that this worker is at is wanted any more. A worker that
+        closing: a shared number; once it is not 0, the results of this worker are not needed any more. A worker that
             has one leaves SIGTERM to the parent too: Slurm sends it to all processes, and a parent that saves a
             checkpoint still waits for its evaluations.
     """
@@ -137,18 +137,18 @@ def start_worker(parent: int, closing: Any = None) -> None:
     if closing is not None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)  # held back while it started
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)  # blocked while it started
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
-    _Here.closing = closing
+    _Worker.closing = closing
 
 
 def closing() -> bool:
-    """Return whether nobody waits any more for what this worker is doing."""
-    return _Here.closing is not None and bool(_Here.closing.value)
+    """Return whether the pool of this worker is closing, so that its results are not needed."""
+    return _Worker.closing is not None and bool(_Worker.closing.value)
 
 
 def loaded(names: Sequence[str]) -> list[str]:
-    """Return which of these modules this process has loaded (a worker should have no PyTorch)."""
+    """Return which of these modules are loaded in this process (a worker should not have PyTorch)."""
     return [name for name in names if name in sys.modules]
 
 
@@ -156,5 +156,5 @@ def _watch(parent: int) -> None:
     while os.getppid() == parent and not closing():
         time.sleep(1.0)
     if os.getppid() == parent:
-        time.sleep(LAST)  # the pool ends its workers itself, unless one of them was killed
+        time.sleep(GRACE)  # the pool ends its workers itself, unless one of them was killed
     os._exit(1)

@@ -1,4 +1,4 @@
-"""Scores: normalization against named references, and the statistics of few seeds."""
+"""Scores: normalization by references, and statistics over a few seeds."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def normalize(value: float, low: float, high: float) -> float:
     return 100.0 * (value - low) / (high - low)
 
 
-LAST = 10  # evaluations behind a run's score
+LAST = 10  # evaluations that a run's score is the mean of
 
 
 def window(evaluations: Mapping[int, Sequence[tuple[float, int]]]) -> tuple[int, ...]:
-    """Return the steps of the evaluations behind a run's score: its last 10."""
+    """Return the steps of the evaluations that a run's score is the mean of: its last 10."""
     return tuple(sorted(evaluations)[-LAST:])
 
 
@@ -46,5 +46,5 @@ def run_return(evaluations: Mapping[int, Sequence[tuple[float, int]]]) -> float:
 
 
 def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
-    """Return mean and standard deviation over seeds (n - 1 below the line); one seed has no deviation."""
+    """Return mean and sample standard deviation (n - 1) over seeds; None for the deviation of one seed."""
     return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None

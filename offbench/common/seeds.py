@@ -1,7 +1,7 @@
 """Every random number of offbench: SeedSequence([seed, purpose, *index]), never a global generator.
 
-What a number is for is part of its seed, so episode i of a dataset depends on (seed, i) alone and comes out
-the same for any number of workers and after any resume.
+The purpose of a number is part of its seed, so episode i of a dataset depends on (seed, i) alone and is the same for
+any number of workers and after any resume.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ class Purpose(IntEnum):
     SAC = 3  # segment i of a behaviour agent's training
     RUNG = 4  # the episodes that screen rung i
     MEASURE = 5  # the episodes that choose rungs
-    REFERENCE = 6  # the episodes behind a published reference score
+    REFERENCE = 6  # the episodes that a reference score is measured in
     WEIGHTS = 7  # initial weights of network i
     CHUNK = 8  # batches and noise of chunk i of a run
     EVALUATION = 9  # the episodes of a run's evaluation at step i
-    SAMPLE = 11  # which transitions or episodes a picture or a check looks at
-    BOOTSTRAP = 12  # the resampled seeds behind an interval
+    SAMPLE = 11  # which transitions or episodes a figure or a check uses
+    BOOTSTRAP = 12  # the resampled seeds of a bootstrap interval
 
 
 def sequence(seed: int, purpose: Purpose, *index: int) -> np.random.SeedSequence:
@@ -33,7 +33,7 @@ def sequence(seed: int, purpose: Purpose, *index: int) -> np.random.SeedSequence
 
 
 def generator(seed: int, purpose: Purpose, *index: int) -> np.random.Generator:
-    """Return a NumPy generator that belongs to this purpose and index alone."""
+    """Return the NumPy generator of one purpose and index."""
     return np.random.default_rng(sequence(seed, purpose, *index))
 
 

@@ -1,4 +1,4 @@
-"""Settings and metadata as frozen dataclasses: defaults, help, ranges and types live in one place, the field itself.
+"""Settings and metadata as frozen dataclasses, whose fields hold their defaults, help, ranges and types.
 
 build       a recipe (TOML), a grid (TOML) or an algorithm's settings (CLI flags, config.json) to a settings object
 read_back   metadata that offbench wrote as JSON (a run's config.json) to a dataclass
@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from offbench.common.errors import OffbenchError, unknown
+from offbench.common.errors import DamagedError, OffbenchError, unknown
 
 T = TypeVar("T")
 
@@ -35,7 +35,7 @@ def setting(
 
     Args:
         low, high: inclusive bounds; `above` is an exclusive lower bound.
-        choices: the words a string may be.
+        choices: the values a string may have.
         per_run: runs that differ in this setting may train in one stack.
         notes: {value: what a user should know who trains with it}.
     """
@@ -83,12 +83,12 @@ def read_back(cls: type[T], values: Any, file: Path | str, remedy: str) -> T:
         file, remedy: for the error line: where the JSON is from, and what to do about it.
 
     Raises:
-        OffbenchError: not a JSON object, a missing key, a wrong type or a value out of range.
+        DamagedError: not a JSON object, a missing key, a wrong type or a value out of range.
     """
     try:
         return _from_json(cls, values)
     except (OffbenchError, ValueError) as error:
-        raise OffbenchError(f"{file} is damaged ({error}); {remedy}") from None
+        raise DamagedError(f"{file} is damaged ({error}); {remedy}") from None
 
 
 def _from_json(cls: type[T], values: Any) -> T:
@@ -129,11 +129,11 @@ def check(cls: type, name: str, value: Any, where: str, *, parse: bool = True) -
 
 
 def _shown(value: Any) -> str:
-    """Return a value for an error line, whatever a file held."""
+    """Return any value of a file as short text for an error line."""
     try:
         return f"{value!r:.60}"
     except (ValueError, RecursionError):  # Python prints no number of 5000 digits
-        return "that"
+        return "this"
 
 
 def _check_range(name: str, value: Any, metadata: Mapping[str, Any], where: str) -> None:
@@ -202,7 +202,7 @@ def _convert_one(value: Any, option: Any, parse: bool) -> Any:
 
 
 def _whole(text: str) -> int:
-    number = float(text)  # so that 1e6 is understood
+    number = float(text)  # to accept 1e6
     if not number.is_integer():
         raise ValueError
     return int(number)
@@ -222,7 +222,7 @@ def _none(text: str) -> None:
 _FROM_TEXT: dict[Any, Callable[[str], Any]] = {int: _whole, float: float, bool: _truth, str: str, type(None): _none}
 
 
-_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "none"}
+_TYPE_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "none"}
 
 
 def _describe(hint: Any) -> str:
@@ -233,5 +233,5 @@ def _describe(hint: Any) -> str:
                 "a list of whole numbers like 256,256 or 256x256" if int in typing.get_args(option) else "a list"
             )
         else:
-            parts.append(_WORDS.get(option, "a table"))
+            parts.append(_TYPE_NAMES.get(option, "a table"))
     return " or ".join(parts)

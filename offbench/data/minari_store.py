@@ -19,7 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
-from offbench.common.files import disk_errors, read_json, sole
+from offbench.common.files import disk_errors, exclusive_lock, read_json
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.data.levels import parse_level
 from offbench.envs.contact_margin import ADDED, EARLIER, MARGIN, without_margin
@@ -220,7 +220,7 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     path = path_of(dataset_id)
     if not path.parent.resolve().is_relative_to(root().resolve()):
         raise OffbenchError(f"{dataset_id} leads out of {root()} by a link; choose another id")
-    with sole(_lock_path(path), f"{dataset_id} is being recorded"):
+    with exclusive_lock(_lock_path(path), f"{dataset_id} is being recorded"):
         with disk_errors(str(path)):
             _recover(path)
         if path.exists() and not overwrite:
@@ -240,7 +240,11 @@ def _size(dataset_id: str) -> str:
 def tidy(dataset_id: str) -> None:
     """Delete what a killed process left beside a dataset, unless one is at work on it or the folder is read-only."""
     path = path_of(dataset_id)
-    with contextlib.suppress(OffbenchError), sole(_lock_path(path), dataset_id, patience=0), disk_errors(str(path)):
+    with (
+        contextlib.suppress(OffbenchError),
+        exclusive_lock(_lock_path(path), dataset_id, timeout=0),
+        disk_errors(str(path)),
+    ):
         _recover(path)
 
 

@@ -1,8 +1,8 @@
-"""Live views of a training, on request: TensorBoard event files beside each run, Weights & Biases.
+"""Live views of training, on request: TensorBoard event files in each run's folder, and Weights & Biases.
 
-Both get what losses.csv and evaluations.csv hold, whenever a checkpoint is written: nothing that a kill could take
-back, so a resumed run shows every step once. TensorBoard's files are written anew when a training goes on; what
-W&B has got is noted in the run's wandb.json. Neither is needed for anything else.
+Both are sent what losses.csv and evaluations.csv hold, and only when a checkpoint is written, so a run that is killed
+and resumed shows every step once. TensorBoard's files are written again when training resumes; the last steps sent to
+W&B are kept in the run's wandb.json.
 """
 
 from __future__ import annotations
@@ -11,15 +11,16 @@ import contextlib
 import importlib.util
 import secrets
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import disk_errors, read_json, write_json
 from offbench.common.scores import normalize
+from offbench.common.settings import read_back
 from offbench.training.run import Run
 
 Losses = Sequence[Mapping[str, float]]
@@ -28,11 +29,11 @@ Evaluations = Mapping[int, Sequence[tuple[float, int]]]
 
 @dataclass(frozen=True)
 class Destinations:
-    """Where a training is to be shown.
+    """Which live views to write.
 
     Attributes:
-        tensorboard: write event files into each run's folder `tensorboard`.
-        wandb: a project of Weights & Biases.
+        tensorboard: event files in each run's folder `tensorboard`.
+        wandb: a Weights & Biases project, or None.
     """
 
     tensorboard: bool = False
@@ -40,9 +41,9 @@ class Destinations:
 
     def check(self) -> None:
         """Raise OffbenchError if a package is missing, before anything is trained."""
-        wanted = {"tensorboard": self.tensorboard, "wandb": self.wandb is not None}
-        for package, asked in wanted.items():
-            if asked and importlib.util.find_spec(package) is None:
+        requested = {"tensorboard": self.tensorboard, "wandb": self.wandb is not None}
+        for package, is_requested in requested.items():
+            if is_requested and importlib.util.find_spec(package) is None:
                 raise OffbenchError(f"--{package} needs the package {package}: pip install 'offbench[{package}]'")
 
 
@@ -50,49 +51,49 @@ NOWHERE = Destinations()
 
 
 class Sink(Protocol):
-    """One run's view in one place."""
+    """One live view of one run."""
 
     def write(self, losses: Losses, evaluations: Evaluations) -> None:
-        """Take in all that is known of the run; send what is new."""
+        """Send the rows of a run that were not sent yet."""
 
     def close(self) -> None:
-        """End it."""
+        """Close the view."""
 
 
 class Loggers(contextlib.AbstractContextManager["Loggers"]):
-    """The views of a stack's runs, open for as long as it trains."""
+    """The live views of a job's runs, open while it trains."""
 
-    def __init__(self, runs: Sequence[Run], to: Destinations) -> None:
-        self.runs, self.to = list(runs), to
+    def __init__(self, runs: Sequence[Run], show: Destinations) -> None:
+        self.runs, self.show = list(runs), show
         self.sinks: list[list[Sink]] = [[] for _ in runs]
 
     def __enter__(self) -> Loggers:
         for run, sinks in zip(self.runs, self.sinks, strict=True):
-            if self.to.tensorboard:
+            if self.show.tensorboard:
                 sinks.append(TensorBoard(run))
-            if self.to.wandb is not None:
-                sinks.append(WandB(run, self.to.wandb))
+            if self.show.wandb is not None:
+                sinks.append(WandB(run, self.show.wandb))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, _: object, __: TracebackType | None) -> None:
         for sink in (sink for sinks in self.sinks for sink in sinks):
             sink.close()
 
-    def write(self, place: int, losses: Losses, evaluations: Evaluations) -> None:
-        """Show all that is known of the run at `place`."""
-        for sink in self.sinks[place]:
+    def write(self, index: int, losses: Losses, evaluations: Evaluations) -> None:
+        """Show all rows of the run at `index`."""
+        for sink in self.sinks[index]:
             sink.write(losses, evaluations)
 
 
 class TensorBoard:
-    """Event files in `<run>/tensorboard`, always equal to what losses.csv and evaluations.csv held when written."""
+    """Event files in `<run>/tensorboard` with the rows of losses.csv and evaluations.csv."""
 
     def __init__(self, run: Run) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
         folder = run.folder / "tensorboard"
         with disk_errors(str(folder)):
-            # those of an earlier process may hold steps after the checkpoint that it goes on from
+            # those of an earlier session may hold steps after the checkpoint that this one resumes from
             for old in folder.glob("events.out.tfevents.*"):
                 old.unlink()
             self.writer = SummaryWriter(str(folder))
@@ -100,7 +101,7 @@ class TensorBoard:
 
     def write(self, losses: Losses, evaluations: Evaluations) -> None:
         """Append the steps that are not in the file yet."""
-        rows, self.sent = _news(losses, evaluations, self.sent, self.reference)
+        rows, self.sent = _unsent(losses, evaluations, self.sent, self.reference)
         for step, values in rows:
             for name, value in values.items():
                 self.writer.add_scalar(name, value, step)
@@ -111,24 +112,35 @@ class TensorBoard:
         self.writer.close()
 
 
+@dataclass(frozen=True)
+class WandBState:
+    """A run's wandb.json: its W&B project and id, and the last steps sent of losses and evaluations."""
+
+    project: str
+    id: str
+    losses: int = -1
+    evaluations: int = -1
+
+
 class WandB:
-    """A run of Weights & Biases. `wandb.json` notes its id and what it has got."""
+    """A run of Weights & Biases."""
 
     def __init__(self, run: Run, project: str) -> None:
         import wandb
 
         config = run.config()
         self.path, self.reference = run.folder / "wandb.json", _reference(run)
-        known = read_json(self.path) if self.path.exists() else {}
-        if known.get("project") != project:
-            known = {"project": project, "id": secrets.token_hex(6), "losses": -1, "evaluations": -1}
-            write_json(self.path, known)
-        self.known: dict[str, Any] = known
+        self.state = WandBState(project, secrets.token_hex(6))
+        if self.path.exists():
+            remedy = "delete it to send everything to a new W&B run"
+            earlier = read_back(WandBState, read_json(self.path), self.path, remedy)
+            self.state = earlier if earlier.project == project else self.state
+        write_json(self.path, asdict(self.state))
         shown = ("algorithm", "variant", "dataset", "dataset_sha256", "seed", "settings", "versions", "command")
         try:
             self.run = wandb.init(
                 project=project,
-                id=known["id"],
+                id=self.state.id,
                 name="/".join(run.folder.parts[-4:]),
                 config={key: getattr(config, key) for key in shown},
                 dir=str(run.folder),
@@ -136,7 +148,7 @@ class WandB:
                 reinit="create_new",  # a stack's runs are open side by side
                 settings=wandb.Settings(silent=True, console="off"),
             )
-        except Exception as error:  # its own errors are many: no key, no network, no such team
+        except Exception as error:  # W&B raises many kinds: no key, no network, no such team
             raise OffbenchError(
                 f"Weights & Biases: {error}; log in with `wandb login`, set WANDB_MODE=offline, or leave out --wandb"
             ) from None
@@ -144,24 +156,24 @@ class WandB:
         self.run.define_metric("*", step_metric="step")  # evaluations arrive after later losses
 
     def write(self, losses: Losses, evaluations: Evaluations) -> None:
-        """Send the steps that were never sent."""
-        rows, sent = _news(losses, evaluations, (self.known["losses"], self.known["evaluations"]), self.reference)
+        """Send the steps that no session has sent."""
+        rows, sent = _unsent(losses, evaluations, (self.state.losses, self.state.evaluations), self.reference)
         if not rows:
             return
-        self.known |= {"losses": sent[0], "evaluations": sent[1]}
-        write_json(self.path, self.known)  # first: a kill in between must not send them twice
+        self.state = replace(self.state, losses=sent[0], evaluations=sent[1])
+        write_json(self.path, asdict(self.state))  # before sending: a kill in between must not send rows twice
         for step, values in rows:
             self.run.log({"step": step, **values})
 
     def close(self) -> None:
-        """Finish it."""
+        """Finish the W&B run."""
         self.run.finish()
 
 
-def _news(
+def _unsent(
     losses: Losses, evaluations: Evaluations, sent: tuple[int, int], reference: tuple[float, float] | None
 ) -> tuple[list[tuple[int, dict[str, float]]], tuple[int, int]]:
-    """Return (step, values) of what comes after the steps sent, in order, and the new last steps."""
+    """Return the (step, values) after `sent`, the last steps of losses and evaluations, and the new last steps."""
     rows = [
         (int(row["step"]), {f"losses/{name}": value for name, value in row.items() if name != "step"})
         for row in losses

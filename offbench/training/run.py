@@ -24,10 +24,10 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import (
     csv_bytes,
     damage,
+    exclusive_lock,
     read_json,
     regular,
     remove_leftovers,
-    sole,
     write_bytes,
     write_json,
 )
@@ -146,7 +146,7 @@ class Run:
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Hold the directory for this process, rid of leftovers. Raises OffbenchError if another one trains it."""
-        with sole(self.folder / ".lock", f"{self.folder} is being trained"):
+        with exclusive_lock(self.folder / ".lock", f"{self.folder} is being trained"):
             remove_leftovers(self.folder)
             yield
 
@@ -200,7 +200,7 @@ class Run:
         """Note in config.json that the run is trained from `step` to `steps`, and with what, if that has changed.
 
         Args:
-            made: device, versions and so on (offbench.common.provenance.made_with).
+            made: device, precision, versions and hardware (offbench.common.provenance.made_with).
         """
         config, written = self.config(), read_json(self.config_path)
         changed = dict(written, steps=max(steps, config.steps))

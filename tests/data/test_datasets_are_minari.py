@@ -15,7 +15,7 @@ import pytest
 import offbench
 from offbench.agents.ladder import read_ladder
 from offbench.common.errors import OffbenchError
-from offbench.common.files import sole
+from offbench.common.files import exclusive_lock
 from offbench.data import minari_store
 from offbench.data.levels import LEVELS
 
@@ -214,7 +214,7 @@ def test_what_a_killed_process_left_beside_a_dataset_goes_when_it_is_asked_for_a
     left = {f".offbench-{name}.{ending}" for ending in ("holder", "old", "partial")}
     for folder in sorted(left)[1:]:
         (minari_store.root() / folder / "data").mkdir(parents=True)
-    with sole(minari_store.root() / f".offbench-{name}.lock", "held"):
+    with exclusive_lock(minari_store.root() / f".offbench-{name}.lock", "held"):
         collect()
         assert beside() == left
     (minari_store.root() / f".offbench-{name}.holder").touch()
