@@ -26,7 +26,7 @@ CASES: dict[str, tuple[str, str]] = {
     "colect hopper": ("unknown command 'colect': did you mean 'collect'?", ""),
     "collect": ("the following arguments are required: ENV", "--help"),
     "collect hoper": ("unknown environment 'hoper': did you mean 'hopper'?", ""),
-    "collect xyzzy": ("unknown environment 'xyzzy': known:", "hopper"),
+    "collect xyzzy": ("unknown environment 'xyzzy': available:", "hopper"),
     "collect hopper --level medum": ("unknown level 'medum': did you mean 'medium'?", ""),
     "collect hopper --level 1.5": ("a fraction for --level must lie above 0 and at most at 1", "1.5"),
     "collect hopper --level nan": ("unknown level 'nan'", ""),
