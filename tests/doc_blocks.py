@@ -160,7 +160,7 @@ def _run_and_stop(command: str, home: Path, environment: dict[str, str]) -> None
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130, errors
-    assert "the same command goes on" in errors
+    assert "rerun the same command to resume" in errors
     print(f"stopped   {command}")
 
 

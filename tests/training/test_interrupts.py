@@ -88,7 +88,7 @@ def test_ctrl_c_and_sigterm_save_a_checkpoint_where_they_arrive(
     assert max(checkpoints.steps(run.folder)) == 300
     assert sorted(run.evaluations()) == [200]
     assert "stopped at step 300, checkpoint saved" in (said := capsys.readouterr().err)
-    assert "the same command goes on" in said
+    assert "rerun the same command to resume" in said
     main(words)
     assert "resuming from step 300" in capsys.readouterr().err
     assert_same_files(run, whole)
@@ -144,7 +144,7 @@ def test_interrupted_worker_processes_save_checkpoints_too(
     assert process.returncode == status
     assert "leaked" not in errors
     assert "Traceback" not in errors
-    assert "the same command goes on" in errors
+    assert "rerun the same command to resume" in errors
     newest = [max(there) for run in runs if (there := checkpoints.steps(run.folder))]
     said = [int(number.replace(",", "")) for number in re.findall(r"stopped at step ([\d,]+)", errors)]
     assert said

@@ -195,7 +195,7 @@ def test_ctrl_c_promises_only_what_a_command_keeps(
     assert stopped.value.code == 130
     said = capsys.readouterr().err
     assert "offbench: stopped" in said
-    assert ("the same command goes on" in said) == goes_on
+    assert ("rerun the same command to resume" in said) == goes_on
 
 
 def test_a_finished_run_is_left_alone(medium: str) -> None:
