@@ -156,7 +156,7 @@ def import_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("file", metavar="FILE.hdf5", help="a D4RL file, or a file that `offbench export` wrote")
     parser.add_argument("--id", dest="dataset_id", required=True, help="the Minari id, e.g. d4rl-hopper-medium-v2")
     env = parser.add_argument(
-        "--env", metavar="RECIPE", help="environment for evaluation (default: guessed from the file's name)"
+        "--env", metavar="RECIPE", help="environment of the file, and for evaluation (default: by its name)"
     )
     completed(env, recipes)
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset with the same id")

@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from offbench.cli.arguments import Parser, auto, completed, local_datasets, seed_list, share, trust, whole
+from offbench.cli.arguments import Parser, auto, completed, local_datasets, recipes, seed_list, share, trust, whole
 from offbench.cli.results import print_scores
 from offbench.common.terminal import hint, note
 
@@ -28,6 +28,10 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     completed(argument, algorithm_names)
     dataset = parser.add_argument("--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets")
     completed(dataset, local_datasets)
+    env = parser.add_argument(
+        "--env", metavar="RECIPE", help="the environment to evaluate in (default: the one that the dataset names)"
+    )
+    completed(env, recipes)
     parser.add_argument(
         "--seeds", type=seed_list, default=[0], metavar="LIST", help="seeds: 3, 0,1,2 or 0:5 (0 to 4) (default: 0)"
     )

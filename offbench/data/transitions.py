@@ -33,7 +33,7 @@ from offbench.data import minari_store
 from offbench.data.file_stamps import ReplacedError, Stamps, checked, recorded, unchanged
 from offbench.data.minari_reader import check_storage, open_parsed, reading
 from offbench.data.recorded_env import evaluation_spec
-from offbench.envs.environments import action_box, box
+from offbench.envs.environments import action_box, box, same_environment
 
 ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
 ATTEMPTS = 3  # to read a dataset that is replaced meanwhile
@@ -59,6 +59,7 @@ class Transitions:
     low: Array
     high: Array
     metadata: dict[str, Any]
+    evaluated_in: str | None = None  # EnvSpec JSON: the user's choice instead of the dataset's environment
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -66,7 +67,7 @@ class Transitions:
     @property
     def env_spec(self) -> str | None:
         """The environment to evaluate in, as EnvSpec JSON; None if the dataset does not name one."""
-        return evaluation_spec(self.metadata)
+        return self.evaluated_in or evaluation_spec(self.metadata)
 
     @property
     def env_id(self) -> str:
@@ -75,7 +76,10 @@ class Transitions:
 
     @property
     def references(self) -> tuple[float, float] | None:
-        """The dataset's own reference returns (random, expert); None if it has none."""
+        """The dataset's own reference returns (random, expert); None if it has none, or of another environment."""
+        recorded = evaluation_spec(self.metadata)
+        if self.evaluated_in and recorded and not same_environment(self.evaluated_in, recorded):
+            return None
         low, high = self.metadata.get("ref_min_score"), self.metadata.get("ref_max_score")
         if low is None or high is None or not float(high) > float(low):
             return None
@@ -137,7 +141,7 @@ def _load(dataset_id: str, stamps: Stamps) -> Transitions:
                     found = _mapped(folder, sources)
     if found is None:
         raise OffbenchError(f"cannot read back {folder}; delete it and try again")
-    content, arrays = found
+    content, arrays = found[0], dict[str, Any](found[1])
     if minari_store.provenance(metadata).get("content_sha256", content) != content:
         raise OffbenchError(
             f"{dataset_id} is damaged: its arrays are not those of the content_sha256 in its metadata; "

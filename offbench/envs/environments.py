@@ -30,7 +30,7 @@ WHAT_MATTERS = ("id", "kwargs", "max_episode_steps")  # with the contact margins
 LARGEST_BOUND = 1e6  # of actions; what has larger ones, such as float32's largest number, has none
 LONGEST = 50_000  # steps that an episode may take in an environment without a time limit
 LARGEST_LIMIT = 1_000_000  # a time limit beyond this is none
-ELSEWHERE = "`offbench train` and `offbench evaluate` take --env RECIPE"
+ELSEWHERE = "give `offbench train` or `offbench evaluate` an --env RECIPE"
 
 
 def env_spec(env_id: str, **kwargs: Any) -> str:
@@ -71,13 +71,13 @@ def checked_spec(text: str, where: str, observation_dim: int, low: Array, high: 
         env = believed_env(text, where)
         _check_spaces(env, where)
     except OffbenchError as error:
-        raise OffbenchError(f"{error}; or evaluate in another environment: {ELSEWHERE}") from error
+        raise OffbenchError(f"{error}; to evaluate in another environment, {ELSEWHERE}") from error
     name = env.spec.id if env.spec else "?"
     shapes = (env.observation_space.shape, env.action_space.shape)
     if shapes != ((observation_dim,), low.shape):
         raise OffbenchError(
             f"{where} has observations ({observation_dim},) and actions {low.shape}; the environment {name} has "
-            f"{shapes[0]} and {shapes[1]}: give the right one with --env ({ELSEWHERE})"
+            f"{shapes[0]} and {shapes[1]}: {ELSEWHERE}"
         )
     actions: Any = env.action_space
     if not same_bounds(actions, low, high):

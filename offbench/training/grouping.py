@@ -32,8 +32,12 @@ Datasets = Mapping[str, Transitions]
 
 
 def load_datasets(specs: Sequence[RunSpec]) -> dict[str, Transitions]:
-    """Return the runs' datasets by name. Raises OffbenchError if one is missing or damaged."""
-    return {name: transitions.load(name) for name in dict.fromkeys(spec.dataset for spec in specs)}
+    """Return the runs' datasets by name, with the environment to evaluate in if the runs name another.
+
+    Raises OffbenchError if one is missing or damaged.
+    """
+    named = {spec.dataset: spec.env_spec for spec in specs}
+    return {name: dataclasses.replace(transitions.load(name), evaluated_in=env) for name, env in named.items()}
 
 
 def check_datasets(datasets: Datasets) -> None:
@@ -45,11 +49,13 @@ def check_datasets(datasets: Datasets) -> None:
     for name, data in datasets.items():
         if data.env_spec:
             checked_spec(data.env_spec, name, data.observations.shape[1], data.low, data.high)
-            say_margin(name, data.metadata, data.env_spec)
+            if data.evaluated_in is None:
+                say_margin(name, data.metadata, data.env_spec)
             warn_other_physics(name, data.metadata.get("offbench", {}).get("versions", {}), data.env_spec)
         else:
             print(
-                f"offbench: {name} names no environment, so nothing is evaluated during training",
+                f"offbench: {name} names no environment, so nothing is evaluated during training; "
+                "`offbench train --env RECIPE` names one",
                 file=sys.stderr,
             )
 

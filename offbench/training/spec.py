@@ -46,6 +46,7 @@ class RunSpec:
         eval_every, eval_episodes: updates between evaluations, and episodes per evaluation.
         folder: the run's folder.
         precision: of matrix products.
+        env_spec: the environment to evaluate in (EnvSpec JSON) instead of the dataset's.
     """
 
     algorithm: str
@@ -57,6 +58,7 @@ class RunSpec:
     eval_episodes: int
     folder: Path
     precision: str = "float32"
+    env_spec: str | None = None
 
     @property
     def run(self) -> Run:
@@ -128,12 +130,14 @@ def specs_of(
     times: Times,
     runs: Path,
     precision: str = "float32",
+    env_spec: str | None = None,
 ) -> list[tuple[RunSpec, ...]]:
     """Return the runs of one algorithm on datasets: a tuple per combination of settings (variant).
 
     Args:
         settings: values by name; a list of values is varied.
         runs: the folder of all run folders.
+        env_spec: the environment to evaluate in (EnvSpec JSON) instead of the datasets'.
 
     Raises:
         OffbenchError: an unknown algorithm or setting, or a bad value.
@@ -153,6 +157,7 @@ def specs_of(
                     times.eval_episodes,
                     run_folder(runs, dataset, algorithm, name, seed),
                     precision,
+                    env_spec,
                 )
                 for dataset, seed in itertools.product(datasets, times.seeds)
             )

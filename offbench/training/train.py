@@ -16,6 +16,7 @@ from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
 from offbench.common.settings import build
 from offbench.data import transitions
+from offbench.envs.recipes import load_recipe
 from offbench.training.devices import Machine, pick_machine
 from offbench.training.grouping import check_datasets, group, load_datasets, pending
 from offbench.training.jobs import raise_first, run_jobs
@@ -30,6 +31,7 @@ def train(
     algorithm: str,
     dataset: str | Sequence[str],
     *,
+    env: str | None = None,
     seeds: int | Sequence[int] = 0,
     steps: int = 1_000_000,
     eval_every: int = 5_000,
@@ -49,6 +51,7 @@ def train(
     Args:
         algorithm: a registered name: td3_bc, bdb, cql, or a third party's.
         dataset: one id of a local Minari dataset, or several.
+        env: the recipe's name or file of the environment to evaluate in, instead of the one that the dataset names.
         seeds: one seed or several; a run's random numbers depend on its own seed alone.
         steps: updates of each run.
         eval_every, eval_episodes: updates between evaluations, and episodes of the deterministic policy in each.
@@ -72,7 +75,8 @@ def train(
     """
     times = Times(_seed_list(seeds), steps, eval_every, eval_episodes)
     names = [dataset] if isinstance(dataset, str) else list(dict.fromkeys(dataset))
-    variants = specs_of(algorithm, settings, names, times, Path(runs), precision)
+    env_spec = load_recipe(env).env_spec() if env is not None else None
+    variants = specs_of(algorithm, settings, names, times, Path(runs), precision, env_spec)
     _check_times(times)
     if not names:
         raise OffbenchError("give at least one dataset")
