@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from offbench.data.transitions import load
     from offbench.evaluation.evaluate import evaluate
     from offbench.evaluation.export_policy import export_policy
+    from offbench.evaluation.policies import load_policy
     from offbench.evaluation.video import video
     from offbench.reports.report import report
     from offbench.tools.doctor import doctor
@@ -54,6 +55,7 @@ __all__ = [
     "import_d4rl",
     "inventory",
     "load",
+    "load_policy",
     "make_env",
     "normalize",
     "report",
@@ -77,6 +79,7 @@ _VERBS = {
     "import_d4rl": ("offbench.data.import_d4rl", "import_d4rl"),
     "inventory": ("offbench.tools.inventory", "inventory"),
     "load": ("offbench.data.transitions", "load"),
+    "load_policy": ("offbench.evaluation.policies", "load_policy"),
     "make_env": ("offbench.data.recorded_env", "make_env"),
     "normalize": ("offbench.analysis.normalize", "normalize_runs_or_returns"),
     "report": ("offbench.reports.report", "report"),

@@ -27,7 +27,7 @@ class Pair:
     b: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """A against B over the datasets and seeds that both have.
 
@@ -53,6 +53,10 @@ class Comparison:
     windows: tuple[str, str]
     comparable: bool
     unfinished: int
+
+    def __repr__(self) -> str:
+        """Return the verdict."""
+        return f"Comparison({self.a} against {self.b}: {self.verdict})"
 
     @property
     def verdict(self) -> str:

@@ -70,6 +70,11 @@ class Method:
         return self.algorithm if self.beta is None else f"{self.algorithm} beta={self.beta}"
 
 
+def method_of(algorithm: str, variant: str, settings: Mapping[str, Any]) -> Method:
+    """Return a method by itself, whatever other methods there are."""
+    return Method(algorithm, variant, _beta(settings.get("beta")))
+
+
 def name_methods(configs: Mapping[tuple[str, str], Sequence[RunConfig]]) -> dict[tuple[str, str], Method]:
     """Return the method of each (algorithm, variant), named so that no two have the same name.
 
@@ -79,7 +84,7 @@ def name_methods(configs: Mapping[tuple[str, str], Sequence[RunConfig]]) -> dict
     Args:
         configs: the config.json of every run of each method.
     """
-    plain = {key: Method(*key, _beta(found[0].settings.get("beta"))) for key, found in configs.items()}
+    plain = {key: method_of(*key, found[0].settings) for key, found in configs.items()}
     names = {}
     for key, method in plain.items():
         labels = {config.label for config in configs[key]}

@@ -6,6 +6,7 @@ steps = 1_000_000                  # with eval_every and eval_episodes as in `of
 [[algorithms]]
 name = "bdb"                       # then its settings; a list makes a variant per value (hidden: a list of lists)
 beta = [0.25, "adaptive"]
+label = "BDB"                      # its name in tables, if the settings are one variant
 steps = 500_000                    # optional: its own seeds, steps, eval_every and eval_episodes
 """
 
@@ -46,13 +47,21 @@ class Source:
     seed: int = 0
 
 
+LONGEST_LABEL = 60
+
+
 @dataclass(frozen=True)
 class Entry:
-    """An algorithm of a grid with its settings (each value of a list is a variant) and its times."""
+    """An algorithm of a grid with its settings (each value of a list is a variant) and its times.
+
+    Attributes:
+        label: the name in tables of the one variant that the settings are; empty for the usual name.
+    """
 
     algorithm: str
     settings: Mapping[str, Any]
     times: Times
+    label: str = ""
 
 
 @dataclass(frozen=True)
@@ -139,7 +148,10 @@ def _entry(value: Any, times: Times, where: str) -> Entry:
     if not isinstance(value, dict) or not isinstance(value.get("name"), str):
         raise OffbenchError(f"{where}: each of [[algorithms]] needs a name")
     own = {field.name for field in dataclasses.fields(Times)}
-    label = f"{where}: {value['name']}"
-    changed = _times({key: item for key, item in value.items() if key in own}, times, label)
-    settings = {key: item for key, item in value.items() if key not in own and key != "name"}
-    return Entry(value["name"], settings, changed)
+    entry = f"{where}: {value['name']}"
+    changed = _times({key: item for key, item in value.items() if key in own}, times, entry)
+    label = value.get("label", "")
+    if not isinstance(label, str) or len(label) > LONGEST_LABEL or not label.isprintable():
+        raise OffbenchError(f"{entry}: label must be a line of at most {LONGEST_LABEL} characters, not {label!r:.80}")
+    settings = {key: item for key, item in value.items() if key not in own and key not in ("name", "label")}
+    return Entry(value["name"], settings, changed, label)

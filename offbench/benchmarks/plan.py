@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from offbench.analysis.methods import method_of
 from offbench.benchmarks.datasets import check_recorded
 from offbench.benchmarks.grid import Grid, Source, load_grid
 from offbench.benchmarks.throughput import Rate, measure, operations, step_seconds
@@ -22,7 +23,7 @@ from offbench.envs.environments import believed_env, make_env
 from offbench.envs.recipes import Recipe, load_recipe
 from offbench.training.devices import Machine, pick_machine
 from offbench.training.run import Run
-from offbench.training.spec import RunSpec, specs_of
+from offbench.training.spec import RunSpec, settings_json, specs_of
 
 # What a large GPU is taken to do of a stack's small float32 products where there is none to measure: a seventh of an
 # H100's 67 Tflop/s.
@@ -77,7 +78,9 @@ def prepare(
     variants = [
         variant
         for entry in read.entries
-        for variant in specs_of(entry.algorithm, entry.settings, datasets, entry.times, Path(runs), precision)
+        for variant in specs_of(
+            entry.algorithm, entry.settings, datasets, entry.times, Path(runs), precision, entry.label
+        )
     ]
     if len({(variant[0].algorithm, variant[0].variant) for variant in variants}) < len(variants):
         raise OffbenchError(f"{read.name}: an algorithm with the same settings comes twice")
@@ -134,7 +137,7 @@ class Plan:
         if machine.device == "cpu":
             self._products += runs * spec.steps * operations(spec, env_spec)
         return (
-            f"  {spec.label:<40}{runs:>4} runs x {spec.steps:>9,} updates, "
+            f"  {_name(spec):<40}{runs:>4} runs x {spec.steps:>9,} updates, "
             f"{rate.updates:>8,.0f} a second: {duration(cost)}"
         )
 
@@ -191,3 +194,8 @@ def _bytes_per_step(spec: str) -> int:
     assert observations is not None
     assert actions is not None
     return 12 * observations[0] + 8 * actions[0] + 34
+
+
+def _name(spec: RunSpec) -> str:
+    """Return a run's method as tables name it."""
+    return spec.label or method_of(spec.algorithm, spec.variant, settings_json(spec.config)).label

@@ -17,7 +17,7 @@ BINS = 12
 BAR = 40
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Summary:
     """What is in a dataset: `lines()` for a terminal, `plot(path)` for a picture."""
 
@@ -44,13 +44,18 @@ class Summary:
             score = normalize(float(self.returns.mean()), float(low), float(high))
             lines.append(f"references   random {low:.1f}, expert {high:.1f}: normalized mean return {score:.1f}")
         lines += ["", *_histogram(self.returns), ""]
+        lines.append("provenance")
         for part in ours.get("parts", []):
-            words = ", ".join(f"{key} {value}" for key, value in part.items())
-            lines.append(f"made from    {words}")
-        made = ", ".join(f"{name} {version}" for name, version in ours.get("versions", {}).items())
-        told = {"seed": ours.get("seed"), "versions": made or None, "content": ours.get("content_sha256")}
-        told["imported"] = ours.get("imported", {}).get("file")
-        return lines + [f"{key:<12} {value}" for key, value in told.items() if value is not None]
+            lines += ["  part", *(f"    {key:<15} {_fact(value)}" for key, value in part.items())]
+        told = {name: ours.get(name) for name in ("env", "level", "seed", "content_sha256", "recipe_sha256")}
+        told["imported from"] = ours.get("imported", {}).get("file")
+        told |= {f"{name} version": version for name, version in ours.get("versions", {}).items()}
+        shown = [f"  {key:<17} {_fact(value)}" for key, value in told.items() if value is not None]
+        return lines + (shown or ["  not recorded by offbench"])
+
+    def __repr__(self) -> str:
+        """Return what a person types to see more."""
+        return f"Summary({self.dataset_id}, {len(self.returns):,} episodes; `lines()` has more)"
 
     def plot(self, path: str | Path) -> Path:
         """Draw the histogram of returns. Raises OffbenchError if the picture cannot be written."""
@@ -77,6 +82,15 @@ def show(dataset_id: str) -> Summary:
     lengths = np.diff(data.ends, prepend=0)
     terminated = float((data.masks[data.ends - 1] == 0).mean())
     return Summary(dataset_id, data.metadata, np.asarray(data.returns), lengths, terminated)
+
+
+def _fact(value: Any) -> str:
+    """Return a value of the metadata as a person writes it."""
+    if isinstance(value, bool) or not isinstance(value, int | float | list):
+        return str(value)
+    if isinstance(value, list):
+        return " to ".join(map(_fact, value))
+    return f"{value:,}" if isinstance(value, int) else f"{value:,.4g}" if abs(value) < 100 else f"{value:,.1f}"
 
 
 def _space(metadata: dict[str, Any], key: str) -> str:

@@ -43,7 +43,7 @@ LEAST_USED = 1e-3  # of the range between the action bounds
 CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding are worth a warning
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Transitions:
     """A dataset as flat arrays, mapped from the cache (see the module's drawing)."""
 
@@ -63,6 +63,11 @@ class Transitions:
 
     def __len__(self) -> int:
         return len(self.rewards)
+
+    def __repr__(self) -> str:
+        """Return id and sizes."""
+        sizes = f"{len(self):,} transitions, {len(self.ends):,} episodes"
+        return f"Transitions({self.dataset_id}, {sizes}, observations {self.observations.shape[1:]})"
 
     @property
     def env_spec(self) -> str | None:

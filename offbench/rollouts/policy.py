@@ -56,9 +56,9 @@ class _Double(NamedTuple):
     high: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Policy:
-    """A policy that acts in NumPy.
+    """A policy that acts in NumPy: `policy(observation)` is the action for `env.step`.
 
     Attributes:
         kind: one of KINDS.
@@ -82,6 +82,34 @@ class Policy:
     critic: Layers = ()
     samples: int = 1
     activation: str = "relu"
+
+    def __repr__(self) -> str:
+        """Return kind, sizes and environment."""
+        sizes = [len(self.observation_mean), *(weight.shape[1] for weight, _ in self.layers[:-1]), len(self.low)]
+        return f"Policy({self.kind}, {' -> '.join(map(str, sizes))}, {self.env_id})"
+
+    def __call__(self, observation: Array, rng: np.random.Generator | None = None) -> npt.NDArray[np.float32]:
+        """Return the action [act] for an observation [obs], or the actions [n, act] for observations [n, obs].
+
+        Args:
+            rng: None for the best action (the mode); a generator to sample. Policies that have no single best action
+                (uniform, best_by_q) draw from a generator of their own without it.
+
+        Raises:
+            OffbenchError: the observation has another shape.
+        """
+        batch, size = np.atleast_2d(np.asarray(observation)), len(self.observation_mean)
+        if batch.ndim != 2 or batch.shape[1] != size:
+            raise OffbenchError(f"the policy takes observations ({size},), not {np.shape(observation)}")
+        noise = self.draw(rng or self._rng, len(batch)) if self.needs_noise(rng is None) else None
+        if self.kind == "uniform" and noise is None:
+            noise = self.draw(self._rng, len(batch))
+        actions = self.act(batch, noise)
+        return actions if np.ndim(observation) == 2 else actions[0]
+
+    @functools.cached_property
+    def _rng(self) -> np.random.Generator:
+        return np.random.default_rng(0)
 
     @functools.cached_property
     def _double(self) -> _Double:

@@ -174,6 +174,7 @@ def _run_config(spec: RunSpec, data: Transitions, device: str, command: str) -> 
     return RunConfig(
         algorithm=spec.algorithm,
         variant=spec.variant,
+        label=spec.label,
         settings=settings_json(spec.config),
         dataset=data.dataset_id,
         dataset_sha256=data.content,

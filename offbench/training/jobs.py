@@ -94,6 +94,8 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
             done = step * len(self.jobs[index].specs)
             self.progress.skip(done, done * self.jobs[index].cost)
         self.steps[index] = step
+        if note and len(self.jobs) > 1:
+            note = f"{self.jobs[index].title}: {note}"
         done_of = {i: step * len(self.jobs[i].specs) for i, step in self.steps.items()}
         work = sum(done * self.jobs[i].cost for i, done in done_of.items())
         self.progress.to(sum(done_of.values()), note, work)

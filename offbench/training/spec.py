@@ -47,6 +47,7 @@ class RunSpec:
         folder: the run's folder.
         precision: of matrix products.
         env_spec: the environment to evaluate in (EnvSpec JSON) instead of the dataset's.
+        label: the method's name in tables, empty for the usual one.
     """
 
     algorithm: str
@@ -59,6 +60,7 @@ class RunSpec:
     folder: Path
     precision: str = "float32"
     env_spec: str | None = None
+    label: str = ""
 
     @property
     def run(self) -> Run:
@@ -69,11 +71,6 @@ class RunSpec:
     def variant(self) -> str:
         """The settings that differ from their defaults."""
         return variant(self.config, self.precision)
-
-    @property
-    def label(self) -> str:
-        """Algorithm and settings as a table shows them: `bdb beta=0.5`."""
-        return f"{self.algorithm} {variant(self.config)}".removesuffix(" default")
 
     @property
     def times(self) -> tuple[int, int, int]:
@@ -131,6 +128,7 @@ def specs_of(
     runs: Path,
     precision: str = "float32",
     env_spec: str | None = None,
+    label: str = "",
 ) -> list[tuple[RunSpec, ...]]:
     """Return the runs of one algorithm on datasets: a tuple per combination of settings (variant).
 
@@ -138,12 +136,19 @@ def specs_of(
         settings: values by name; a list of values is varied.
         runs: the folder of all run folders.
         env_spec: the environment to evaluate in (EnvSpec JSON) instead of the datasets'.
+        label: the name in tables of the one variant that the settings are.
 
     Raises:
-        OffbenchError: an unknown algorithm or setting, or a bad value.
+        OffbenchError: an unknown algorithm or setting, a bad value, or a label for several variants.
     """
     variants = []
-    for config in configurations(load_algorithm(algorithm).Config, settings, algorithm):
+    configs = configurations(load_algorithm(algorithm).Config, settings, algorithm)
+    if label and len(configs) > 1:
+        raise OffbenchError(
+            f"{algorithm}: the label {label!r} names one variant, and the settings are {len(configs)}; "
+            "give each an entry of its own"
+        )
+    for config in configs:
         name = variant(config, precision)
         variants.append(
             tuple(
@@ -158,6 +163,7 @@ def specs_of(
                     run_folder(runs, dataset, algorithm, name, seed),
                     precision,
                     env_spec,
+                    label,
                 )
                 for dataset, seed in itertools.product(datasets, times.seeds)
             )

@@ -228,5 +228,5 @@ class Trainer:
             return ""
         references = self.stack.data[0].references
         if references is None:
-            return f"return {np.mean(means):.0f}"
-        return f"score {np.mean([normalize(mean, *references) for mean in means]):.1f}"
+            return f"return {np.mean(means):.0f} at step {step:,}"
+        return f"score {np.mean([normalize(mean, *references) for mean in means]):.1f} at step {step:,}"

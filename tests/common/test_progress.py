@@ -50,7 +50,7 @@ def test_what_is_slow_is_still_to_come(clock: Clock, capsys: pytest.CaptureFixtu
         clock.now = 250.0
         bar.report(1, 60, "")
         # 230 units in 250 s, 120 left
-        assert last_line(capsys) == "3 runs: 2,060/2,100 steps, 8 steps/s, 2 min 10 s left, score 7"
+        assert last_line(capsys) == "3 runs: 2,060/2,100 steps, 8 steps/s, 2 min 10 s left, cql on x-v0: score 7"
 
 
 def test_a_terminal_shows_the_same(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
