@@ -109,12 +109,12 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     trust(parser)
 
     def similar(path: str, tolerance: float, action_tolerance: float, seed: int) -> None:
-        from offbench.evaluation.evaluate import similarity
+        from offbench.evaluation.similarity import similarity
 
         result = similarity(path, tolerance=tolerance, action_tolerance=action_tolerance, seed=seed)
-        print(f"{path}: similar score at step {result['step']:,} over {result['samples']:,} transitions")
-        print(f"by Q       {result['q_similar']:.2f}%  (within {100 * tolerance:g}% of |Q1(s, a)|)")
-        print(f"by action  {result['action_similar']:.2f}%  (root mean square distance at most {action_tolerance:g})")
+        print(f"{path}: similar score at step {result.step:,} over {result.samples:,} transitions")
+        print(f"by Q       {result.q_similar:.2f}%  (within {100 * tolerance:g}% of |Q1(s, a)|)")
+        print(f"by action  {result.action_similar:.2f}%  (root mean square distance at most {action_tolerance:g})")
 
     def run(paths: list[str], similarity: bool, tolerance: float, action_tolerance: float, **arguments: Any) -> None:
         from offbench.evaluation.evaluate import evaluate

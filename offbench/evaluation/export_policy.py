@@ -1,4 +1,4 @@
-"""`export-policy`: a trained policy as TorchScript, to be played where there is no offbench."""
+"""`export-policy`: a trained policy as TorchScript, which runs without offbench."""
 
 # no `from __future__ import annotations` here: TorchScript reads the annotations of Actor
 import io
@@ -22,7 +22,7 @@ ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
 class Actor(nn.Module):
     """observations [n, obs] (any float type) -> actions [n, act] float32 in the environment's bounds: the mode.
 
-    In float64 until the end, as `Policy.act` computes it.
+    It computes in float64 until the end, as `Policy.act` does.
     """
 
     mean: Tensor
@@ -59,24 +59,24 @@ def _double(array: Array) -> Tensor:
 def export_policy(path: str | Path, out: str | Path) -> Path:
     """Write a run's policy, or a policy file, as TorchScript: `torch.jit.load(out)(observations)` acts.
 
-    The file also says where the policy comes from (`_extra_files`, "offbench.json").
+    The file also holds where the policy comes from (`_extra_files`, "offbench.json").
 
     Raises:
-        OffbenchError: no policy there, one that has no single best action, a file that does not end in .pt, no such
-            folder, or the disk refuses.
+        OffbenchError: there is no policy, it has no single best action, the file does not end in .pt, its folder does
+            not exist, or it cannot be written.
     """
-    place, target = Path(path), output_file(out)
+    source, target = Path(path), output_file(out)
     if target.suffix.lower() not in ENDINGS:
         raise OffbenchError(f"cannot write {target.name!r}: policies are exported as TorchScript; give --out FILE.pt")
-    policy = load_policy(Run(place).policy_path if place.is_dir() else place)
+    policy = load_policy(Run(source).policy_path if source.is_dir() else source)
     if policy.kind not in ("tanh", "squashed_gaussian"):
         reason = "chooses among random actions" if policy.kind == "best_by_q" else "is random"
-        raise OffbenchError(f"{path} {reason} ({policy.kind}): TorchScript holds policies that act by themselves")
-    data, about = io.BytesIO(), {"env_id": policy.env_id, "kind": policy.kind, "origin": policy.origin}
+        raise OffbenchError(f"{path} {reason} ({policy.kind}); only policies with one best action can be exported")
+    data, origin = io.BytesIO(), {"env_id": policy.env_id, "kind": policy.kind, "origin": policy.origin}
     with warnings.catch_warnings():
-        # deprecated, but every PyTorch since 1.0 reads it; torch.export's files need the PyTorch that wrote them
+        # deprecated, but every PyTorch since 1.0 reads it; files of torch.export need the version that wrote them
         warnings.simplefilter("ignore", DeprecationWarning)
         scripted = torch.jit.script(Actor(policy).eval())
-        torch.jit.save(scripted, data, _extra_files={"offbench.json": json.dumps(about)})
+        torch.jit.save(scripted, data, _extra_files={"offbench.json": json.dumps(origin)})
     write_bytes(target, data.getvalue())
     return target

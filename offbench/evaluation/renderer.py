@@ -1,4 +1,4 @@
-"""Off-screen rendering: which of MuJoCo's ways to draw without a screen works here."""
+"""Off-screen rendering: which of MuJoCo's rendering backends works on this machine."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from collections.abc import Iterator
 
 BACKENDS = ("egl", "osmesa")
 KEY = "MUJOCO_GL"
-PATIENCE = 60  # seconds that a probe may take
+TIMEOUT = 60  # seconds that a probe may take
 NO_RENDERER = (
-    "MuJoCo cannot draw here: neither EGL nor OSMesa works; install one of them, e.g. `apt-get install libegl1 "
+    "MuJoCo cannot render: neither EGL nor OSMesa works; install one of them, e.g. `apt-get install libegl1 "
     "libgl1-mesa-dri` or `apt-get install libosmesa6` (conda: mesalib)"
 )
 PROBE = """
@@ -29,19 +29,19 @@ with mujoco.Renderer(model, 16, 16) as renderer:
 
 @functools.cache
 def working_backend() -> str | None:
-    """Return the first of the user's MUJOCO_GL, EGL and OSMesa that draws a picture; None if none does.
+    """Return the first of the user's MUJOCO_GL, EGL and OSMesa that renders an image, or None.
 
-    Each is tried in a process of its own: a broken driver may crash it, and MuJoCo chooses but once a process.
+    Each is tried in its own process: a broken driver may crash it, and MuJoCo chooses a backend once per process.
     """
     own = os.environ.get(KEY)
-    return next((name for name in dict.fromkeys([own, *BACKENDS] if own else BACKENDS) if _draws(name)), None)
+    return next((name for name in dict.fromkeys([own, *BACKENDS] if own else BACKENDS) if _renders(name)), None)
 
 
-def _draws(backend: str) -> bool:
+def _renders(backend: str) -> bool:
     environment = {key: value for key, value in os.environ.items() if key != "PYOPENGL_PLATFORM"} | {KEY: backend}
     try:
         done = subprocess.run(
-            [sys.executable, "-c", PROBE], env=environment, capture_output=True, timeout=PATIENCE, check=False
+            [sys.executable, "-c", PROBE], env=environment, capture_output=True, timeout=TIMEOUT, check=False
         )
     except subprocess.TimeoutExpired:
         return False
@@ -50,7 +50,7 @@ def _draws(backend: str) -> bool:
 
 @contextlib.contextmanager
 def drawing_with(backend: str | None) -> Iterator[None]:
-    """Let MuJoCo draw with `backend`, which it reads from the environment; None leaves things as they are.
+    """Let MuJoCo render with `backend`, by its environment variable; None changes nothing.
 
     PyOpenGL's own variable is left out: MuJoCo refuses to load if it names another renderer.
     """

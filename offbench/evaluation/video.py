@@ -1,8 +1,8 @@
-"""`video`: episodes of a policy as a film (.mp4) or a moving picture (.gif), drawn off-screen.
+"""`video`: episodes of a policy as a video (.mp4 or .gif), rendered off-screen.
 
-    policy -> steps -> every k-th frame, k steps of the environment in 1/fps seconds -> step and return on it -> file
+    policy -> steps -> every k-th frame (k steps take 1/fps seconds) -> step and return on it -> file
 
-A film runs in real time: k follows from the environment's own frame rate (125 steps a second in Hopper).
+A video runs in real time: k follows from the environment's own frame rate (125 steps per second in Hopper).
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 ENDINGS = (".gif", ".mp4")
-COLOURS = 64  # of a GIF
-STREAM = (int(Purpose.REFERENCE), 3)  # episodes of their own, seen in no measurement
+COLORS = 64  # of a GIF
+STREAM = (int(Purpose.REFERENCE), 3)  # other episodes than those of any measurement
 
 
 def video(
@@ -52,46 +52,46 @@ def video(
     fps: int = 25,
     size: int = 480,
 ) -> Path:
-    """Film episodes of a run's policy, of a policy file, or of a level.
+    """Record a video of episodes of a run's policy, of a policy file, or of a level.
 
     Args:
-        path: a run directory or a policy file, which act deterministically; or ENV:LEVEL such as `hopper:medium`,
+        path: a run folder or a policy file, which act deterministically; or ENV:LEVEL such as `hopper:medium`,
             whose actions are sampled as they are in its dataset.
-        out: the film's file, .gif or .mp4.
+        out: the video's file, .gif or .mp4.
         env: a recipe, instead of the environment that the run or policy names.
         episodes: how many, one after the other.
-        seconds: length of the film at most (default: whole episodes).
+        seconds: the longest duration (default: whole episodes).
         seed: of the episodes.
-        fps: frames a second, about: films run in real time, and show whole steps.
+        fps: about how many frames per second: videos run in real time, and a frame shows a whole number of steps.
         size: the longer side in pixels.
 
     Returns:
         The file.
 
     Raises:
-        OffbenchError: no such policy or folder, an environment that cannot be drawn, no renderer, no mp4 encoder.
+        OffbenchError: no such policy or folder, an environment that cannot be rendered, no renderer, no mp4 encoder.
     """
     target = output_file(out)
     if target.suffix.lower() not in ENDINGS:
-        raise OffbenchError(f"a video's file ends in {' or '.join(ENDINGS)}, not {target.name!r}")
+        raise OffbenchError(f"a video's name must end in {' or '.join(ENDINGS)}, not {target.name!r}")
     if min(episodes, fps, size) < 1 or (seconds is not None and seconds <= 0):
         raise OffbenchError("episodes, seconds, fps and size must be more than 0")
     encode = _gif if target.suffix.lower() == ".gif" else _encoder()
     backend = working_backend()
     with contextlib.ExitStack() as drawing:
         drawing.enter_context(drawing_with(backend))  # before MuJoCo is loaded, which chooses its renderer then
-        policy, spec, sampled = _who(str(path), env)
-        world = drawing.enter_context(_drawable(spec, backend))
+        policy, spec, sampled = _policy_of(str(path), env)
+        world = drawing.enter_context(_renderable(spec, backend))
         if seconds is None and time_limit(world.spec) is None:
             raise OffbenchError(f"{json.loads(spec)['id']} has no time limit (max_episode_steps); give --seconds")
         rate = float(world.metadata.get("render_fps") or fps)
         every = max(1, round(rate / fps))
         most = seconds * rate if seconds else float("inf")
-        encode(target, _episodes(_Film(world, policy, sampled, every, size), seed, episodes, most), rate / every)
+        encode(target, _episodes(_Recording(world, policy, sampled, every, size), seed, episodes, most), rate / every)
     return target
 
 
-def _who(path: str, env: str | None) -> tuple[Policy, str, bool]:
+def _policy_of(path: str, env: str | None) -> tuple[Policy, str, bool]:
     """Return the policy, its EnvSpec and whether its actions are sampled."""
     name, colon, level = path.rpartition(":")
     if not colon or Path(path).exists():
@@ -106,24 +106,25 @@ def _who(path: str, env: str | None) -> tuple[Policy, str, bool]:
         world.close()
         return uniform(space.low, space.high, shape[0], recipe.env_id), spec, True  # type: ignore[attr-defined, index]
     if source == "replay" or level == "medium-expert":
-        raise OffbenchError(f"{level} is not of one policy; film random, medium, expert or a fraction")
+        raise OffbenchError(f"{level} is not of one policy; choose random, medium, expert or a fraction")
     ladder = find_ladder(recipe)
     if ladder is None:
         raise OffbenchError(
-            f"no ladder of {name} is shipped or in {BEHAVIOUR}/; give a policy file of your own training"
+            f"no ladder of {name} is shipped or in {BEHAVIOUR}/; give a policy file, or train an agent: "
+            f"`offbench behaviour {name}`"
         )
     rung = ladder.role(source) if source in ("medium", "expert") else ladder.nearest(float(source))
     return ladder.load(rung), spec, True
 
 
-def _drawable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
-    """Make the environment for drawing. Raises OffbenchError if it cannot be drawn here."""
+def _renderable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
+    """Make the environment for rendering. Raises OffbenchError if it cannot be rendered here."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that it does not list this mode: its first picture tells
+            warnings.simplefilter("ignore")  # that it does not list this mode: the first frame shows whether it has it
             env = make_env(spec, "rgb_array")
     except Exception as error:  # a third party's environment may raise anything here
-        raise OffbenchError(f"{json.loads(spec)['id']} cannot be filmed (render_mode rgb_array): {error}") from error
+        raise OffbenchError(f"{json.loads(spec)['id']} cannot be rendered (render_mode rgb_array): {error}") from error
     world: Any = env.unwrapped
     if hasattr(world, "mujoco_renderer"):
         import mujoco
@@ -131,15 +132,15 @@ def _drawable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
         if backend is None:
             env.close()
             raise OffbenchError(NO_RENDERER)
-        # Gymnasium 1.4 looks from where the model stood at first; the models have a camera that goes along
+        # Gymnasium 1.4 renders from a fixed camera; the models have one that follows
         if (camera := mujoco.mj_name2id(world.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")) >= 0:
             world.mujoco_renderer.camera_id = camera
     return env
 
 
 @dataclass(frozen=True)
-class _Film:
-    """Who is filmed, whether its actions are sampled, every how many steps, and the longer side in pixels."""
+class _Recording:
+    """What to record: environment, policy, whether to sample actions, steps per frame, longer side in pixels."""
 
     env: gym.Env[Any, Any]
     policy: Policy
@@ -148,49 +149,49 @@ class _Film:
     size: int
 
 
-def _episodes(film: _Film, seed: int, count: int, most: float) -> Iterator[Image]:
-    """Yield the frames of episode after episode, of `most` steps together."""
+def _episodes(recording: _Recording, seed: int, count: int, most: float) -> Iterator[Image]:
+    """Yield the frames of one episode after another, `most` steps in all."""
     for index in range(count):
         if most > 0:
-            most -= yield from _episode(film, seed, index, most)
+            most -= yield from _episode(recording, seed, index, most)
 
 
-def _episode(film: _Film, seed: int, index: int, most: float) -> Generator[Image, None, int]:
-    """Play one episode; yield every so many steps a frame, and the last; return its steps."""
-    env, policy = film.env, film.policy
+def _episode(recording: _Recording, seed: int, index: int, most: float) -> Generator[Image, None, int]:
+    """Play one episode; yield a frame every few steps, and the last one; return the episode's steps."""
+    env, policy = recording.env, recording.policy
     rng = seeds.generator(seed, Purpose.ACTION, *STREAM, index)
-    noisy = policy.needs_noise(not film.sampled)
+    noisy = policy.needs_noise(not recording.sampled)
     observation, _ = env.reset(seed=seeds.integer(seed, Purpose.RESET, *STREAM, index))
     step, total, over = 0, 0.0, False
-    yield _frame(env, step, total, film.size)
+    yield _frame(env, step, total, recording.size)
     while not over:
         noise = policy.draw(rng, 1) if noisy else None
         observation, reward, terminated, truncated, _ = env.step(policy.act(np.asarray(observation)[None], noise)[0])
         step, total = step + 1, total + number(reward)
         over = bool(terminated or truncated or step >= most)
-        if over or step % film.every == 0:
-            yield _frame(env, step, total, film.size)
+        if over or step % recording.every == 0:
+            yield _frame(env, step, total, recording.size)
     return step
 
 
 def _frame(env: gym.Env[Any, Any], step: int, total: float, size: int) -> Image:
-    """Draw the environment as it stands, with step and return on it."""
+    """Render the environment's current state, with step and return on it."""
     from PIL import Image, ImageDraw, ImageFont
 
     name = env.spec.id if env.spec else "the environment"
     try:
         pixels = env.render()
     except NotImplementedError:
-        raise OffbenchError(f"{name} cannot be filmed: it has no rgb_array rendering") from None
+        raise OffbenchError(f"{name} cannot be rendered: it has no rgb_array rendering") from None
     except Exception as error:  # a third party's environment may raise anything here
         lacks = error.name if isinstance(error, ModuleNotFoundError) else None
         hint = f"; install the package that has {lacks}" if lacks else ""  # Gymnasium's own errors say which
-        raise OffbenchError(f"{name} cannot be filmed: {str(error) or type(error).__name__}{hint}") from error
+        raise OffbenchError(f"{name} cannot be rendered: {str(error) or type(error).__name__}{hint}") from error
     if not isinstance(pixels, np.ndarray) or pixels.ndim != 3:
-        raise OffbenchError(f"the environment draws {type(pixels).__name__}, not a picture of [height, width, 3]")
+        raise OffbenchError(f"{name} renders {type(pixels).__name__}, not an image [height, width, 3]")
     image = Image.fromarray(pixels[..., :3].astype(np.uint8))
     scale = size / max(image.size)
-    # even sides, which mp4's pixel format asks for
+    # even sides, which mp4's pixel format needs
     width, height = (max(2, round(side * scale / 2) * 2) for side in image.size)
     image = image.resize((width, height), Image.Resampling.LANCZOS)
     font = ImageFont.load_default(max(10, height // 18))
@@ -201,7 +202,7 @@ def _frame(env: gym.Env[Any, Any], step: int, total: float, size: int) -> Image:
 
 
 def _gif(path: Path, frames: Iterator[Image], fps: float) -> None:
-    first, *rest = [frame.quantize(COLOURS) for frame in frames]
+    first, *rest = [frame.quantize(COLORS) for frame in frames]
     data = io.BytesIO()
     # a GIF counts in hundredths of a second
     first.save(data, "GIF", save_all=True, append_images=rest, duration=round(100 / fps) * 10, loop=0, optimize=True)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from offbench.analysis.methods import Method
 from offbench.analysis.results import Entry, Results
-from offbench.common.errors import OffbenchError
-from offbench.common.files import read_json
 from offbench.common.scores import mean_std
 from offbench.common.tables import Cell, Table
+from offbench.evaluation.similarity import Similarity, read_similarity
 from offbench.reports.tables import NONE, is_papers_grid, plus_minus, published, row_name
 
 
@@ -28,7 +26,7 @@ def similarity_tables(results: Results) -> list[Table]:
                 cells.append(NONE)
                 continue
             values = found[task, method]
-            by_q, by_action = (mean_std([float(v[key]) for v in values]) for key in ("q_similar", "action_similar"))
+            by_q, by_action = (mean_std([getattr(v, key) for v in values]) for key in ("q_similar", "action_similar"))
             number = paper.get((env, level, _similar_name(method)))
             cells.append(Cell(plus_minus(by_q), by_q[0], f"paper {number}" if number else ""))
             details.append([*row_name(results, task), *_similar_row(method, values, by_q, by_action, number)])
@@ -52,18 +50,9 @@ def similarity_tables(results: Results) -> list[Table]:
     ]
 
 
-def _similar(entry: Entry) -> list[Mapping[str, Any]]:
-    """Return what `offbench evaluate --similarity` wrote into the runs of a cell."""
-    found: list[Mapping[str, Any]] = []
-    for trained in entry.runs:
-        path = trained.run.folder / "similarity.json"
-        if path.exists():
-            values = read_json(path)
-            keys = ("q_similar", "action_similar", "step", "samples", "tolerance", "action_tolerance")
-            if not isinstance(values, dict) or not all(isinstance(values.get(key), int | float) for key in keys):
-                raise OffbenchError(f"{path} is damaged; write it again with `offbench evaluate RUN --similarity`")
-            found.append(values)
-    return found
+def _similar(entry: Entry) -> list[Similarity]:
+    """Return the similar scores of the runs of a cell that have one."""
+    return [score for trained in entry.runs if (score := read_similarity(trained.run)) is not None]
 
 
 def _similar_name(method: Method) -> str:
@@ -72,13 +61,13 @@ def _similar_name(method: Method) -> str:
 
 def _similar_row(
     method: Method,
-    values: Sequence[Mapping[str, Any]],
+    values: Sequence[Similarity],
     by_q: tuple[float, float | None],
     by_action: tuple[float, float | None],
     number: str | None,
 ) -> list[Cell]:
-    steps, samples = (sorted({int(v[key]) for v in values}) for key in ("step", "samples"))
-    tolerances = sorted({f"Q {v['tolerance']:g}, action {v['action_tolerance']:g}" for v in values})
+    steps, samples = (sorted({getattr(v, key) for v in values}) for key in ("step", "samples"))
+    tolerances = sorted({f"Q {v.tolerance:g}, action {v.action_tolerance:g}" for v in values})
     numbers = [Cell(", ".join(f"{n:,}" for n in ns), ns[0]) for ns in (steps, samples)]
     return [
         Cell(method.label),

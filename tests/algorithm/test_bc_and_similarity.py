@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import torch
 import offbench
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
-from offbench.evaluation.evaluate import similarity
+from offbench.evaluation.similarity import similarity
 from offbench.rollouts.policy import load_policy
 from offbench.training.run import Run
 from offbench.training.train import restore
@@ -50,8 +51,8 @@ def test_bc_clones_the_data_and_top_the_best_of_it() -> None:
 
 def test_similar_score_by_hand(medium: str) -> None:
     (folder,) = offbench.train("td3_bc", medium, steps=300, **SMALL)
-    found = similarity(folder, samples=400, tolerance=0.02, action_tolerance=0.3)
-    assert json.loads((folder / "similarity.json").read_text()) == found
+    score = similarity(folder, samples=400, tolerance=0.02, action_tolerance=0.3)
+    assert json.loads((folder / "similarity.json").read_text()) == dataclasses.asdict(score)
     stack, data = restore(Run(folder)), offbench.load(medium)
     rng = np.random.default_rng(np.random.SeedSequence([0, 11]))
     chosen = rng.integers(len(data), size=(1, 400))[0]
@@ -61,10 +62,10 @@ def test_similar_score_by_hand(medium: str) -> None:
     inputs = torch.from_numpy((states - mean) / std).unsqueeze(0)
     critic: Any = stack.algorithm.learned["critic"]
     q_pi, q = (critic(inputs, torch.from_numpy(a).unsqueeze(0))[0, 0].detach().numpy() for a in (pi, actions))
-    assert found["q_similar"] == pytest.approx(100 * np.mean(np.abs(q_pi - q) <= 0.02 * np.abs(q)), abs=0.3)
+    assert score.q_similar == pytest.approx(100 * np.mean(np.abs(q_pi - q) <= 0.02 * np.abs(q)), abs=0.3)
     distance = np.sqrt(((pi - actions) ** 2).mean(1))
-    assert found["action_similar"] == pytest.approx(100 * np.mean(distance <= 0.3), abs=0.3)
-    assert 0 < found["action_similar"] < 100
+    assert score.action_similar == pytest.approx(100 * np.mean(distance <= 0.3), abs=0.3)
+    assert 0 < score.action_similar < 100
 
 
 def test_similarity_on_the_command_line(medium: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -144,7 +144,7 @@ def test_an_environment_that_does_not_draw_is_one_line(mode: str, home: Path, of
     done = offbench_cli("video", str(POLICY), "--env", "./tank.toml")
     assert done.returncode == 2, done.stderr
     (line,) = done.stderr.splitlines()
-    assert line.startswith("offbench: Tank-v0 cannot be filmed")
+    assert line.startswith("offbench: Tank-v0 cannot be rendered")
     if "render_mode" in mode:
         assert line.endswith("it has no rgb_array rendering")
     assert not list(home.glob("*.gif"))
@@ -169,7 +169,7 @@ def test_an_environment_without_its_renderer_is_one_line(
     done = offbench_cli("video", str(POLICY), "--env", "./tank.toml")
     assert done.returncode == 2, done.stderr
     (line,) = done.stderr.splitlines()
-    assert line.startswith("offbench: Tank-v0 cannot be filmed")
+    assert line.startswith("offbench: Tank-v0 cannot be rendered")
     assert remedy in line
     assert not list(home.glob("*.gif"))
 

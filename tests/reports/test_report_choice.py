@@ -35,7 +35,7 @@ def test_a_title_some_datasets_and_some_methods(home: Path) -> None:
     assert [row["level"] for row in table] == ["medium", "expert"]
     assert list(table[0])[2:] == ["td3_bc (30,000 steps)", "bdb (beta=0.5) (30,000 steps)"]
     assert "cql" not in page.text
-    with pytest.raises(OffbenchError, match="unknown dataset 'z-\\*': known: x-expert-v0"):
+    with pytest.raises(OffbenchError, match="unknown dataset 'z-\\*': available: x-expert-v0"):
         offbench.report("runs", "out", datasets=["z-*"])
     with pytest.raises(OffbenchError, match="bc has no evaluated runs here"):
         offbench.report("runs", "out", methods=["bc"])

@@ -1,0 +1,107 @@
+"""`evaluate --similarity`: how often a policy's action counts as the dataset's (the BDB paper's Table 2).
+
+The paper gives no formula; its numbers count samples of a batch of 256 that pass a yes/no test "based on the current
+Q-value". offbench computes two readings of it:
+
+    q_similar       |Q1(s, pi(s)) - Q1(s, a)| <= tolerance |Q1(s, a)|
+    action_similar  root mean square of pi(s) - a over the dimensions <= action_tolerance, actions in [-1, 1]
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from offbench.common.errors import OffbenchError
+from offbench.common.files import read_json, write_json
+from offbench.common.seeds import Purpose, generator
+from offbench.common.settings import read_back
+from offbench.training.run import Run
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """A run's similarity.json.
+
+    Attributes:
+        step: of the checkpoint that was evaluated.
+        samples: transitions drawn from the run's dataset.
+        q_similar, action_similar: percent of the samples, by the two readings.
+    """
+
+    step: int
+    samples: int
+    q_similar: float
+    tolerance: float
+    action_similar: float
+    action_tolerance: float
+
+
+def similarity(
+    path: str | Path,
+    *,
+    tolerance: float = 0.05,
+    action_tolerance: float = 0.1,
+    samples: int = 2560,
+    seed: int = 0,
+) -> Similarity:
+    """Return a run's similar score in both readings, and write it to the run's similarity.json.
+
+    Args:
+        path: the run's folder.
+        samples: transitions drawn from the run's dataset (ten batches of 256).
+
+    Raises:
+        OffbenchError: no run or checkpoint there, or the algorithm has no critic.
+    """
+    import torch  # slow to import; reports only read similarity.json
+
+    from offbench.algorithm.networks import Network
+    from offbench.training.train import restore
+
+    run = Run(Path(path))
+    stack = restore(run)
+    critic = stack.algorithm.learned.get("critic")
+    if not isinstance(critic, Network):
+        raise OffbenchError(f"{path}: {run.config().algorithm} has no critic to compare by")
+    rng = generator(seed, Purpose.SAMPLE)
+    batch = stack.store.batch(torch.from_numpy(rng.integers(stack.store.sizes[0], size=(1, samples))))
+    policy = stack.policy(0)
+    dim, act = len(policy.observation_mean), len(policy.low)
+    policy = dataclasses.replace(  # acts on normalized observations, in [-1, 1], as the critic sees them
+        policy,
+        observation_mean=np.zeros(dim, np.float32),
+        observation_std=np.ones(dim, np.float32),
+        low=-np.ones(act, np.float32),
+        high=np.ones(act, np.float32),
+    )
+    noise = policy.draw(rng, samples) if policy.needs_noise(deterministic=True) else None
+    pi = torch.from_numpy(policy.act(batch.observations[0].numpy(), noise)).unsqueeze(0)
+    q_pi, q_data = (critic.frozen(batch.observations, a, members=0).flatten() for a in (pi, batch.actions))
+    distance = (pi - batch.actions).square().mean(-1).sqrt().flatten()
+    score = Similarity(
+        stack.step,
+        samples,
+        100 * float(((q_pi - q_data).abs() <= tolerance * q_data.abs()).float().mean()),
+        tolerance,
+        100 * float((distance <= action_tolerance).float().mean()),
+        action_tolerance,
+    )
+    write_json(_file(run), dataclasses.asdict(score))
+    return score
+
+
+def read_similarity(run: Run) -> Similarity | None:
+    """Read a run's similarity.json; None if there is none. Raises OffbenchError if it is damaged."""
+    path = _file(run)
+    if not path.exists():
+        return None
+    remedy = f"write it again with `offbench evaluate {run.folder} --similarity`"
+    return read_back(Similarity, read_json(path), path, remedy)
+
+
+def _file(run: Run) -> Path:
+    return run.folder / "similarity.json"
