@@ -13,6 +13,7 @@ expert's reference score is measured on another, so that it is not flattered by 
 
 from __future__ import annotations
 
+import itertools
 import math
 import shutil
 import sys
@@ -27,7 +28,7 @@ from offbench.agents.ladder import MEDIUM, MEDIUM_AT_MOST, Ladder, read_ladder
 from offbench.agents.medium_replay import replay_episodes, save_replay
 from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common.errors import OffbenchError
-from offbench.common.files import csv_bytes, disk_errors, read_json, write_bytes, write_json
+from offbench.common.files import csv_bytes, damage, disk_errors, read_json, write_bytes, write_json
 from offbench.common.provenance import versions
 from offbench.common.seeds import Purpose
 from offbench.envs.environments import make_env
@@ -37,7 +38,8 @@ from offbench.rollouts.rollouts import MEASURES, Outcome, Rollouts, result, summ
 
 CANDIDATES = 8  # late rungs that are measured to choose the expert
 LOOKS = 6  # rungs that are measured to find the one nearest a return
-CROSSINGS = 3  # pairs of neighboring rungs between which policies within a segment are measured
+CROSSINGS = 3  # pairs of neighboring rungs between which policies within a segment are screened
+MEASURED = "measured.json"  # in a training's folder: a build that was interrupted resumes from it
 COLUMNS = ("step", "hours", "role", "policy", *MEASURES, *(f"deterministic_{m}" for m in MEASURES), "episodes")
 
 
@@ -61,7 +63,27 @@ class RungEvaluator:
         self.folder, self.rollouts = folder, rollouts
         self.screened = {int(row["step"]): row for row in rows}
         self.within = [step for step in policy_steps if step not in self.screened]
+        self.screened_within: dict[int, float] = {}  # mean returns
         self.measured: dict[int, dict[str, float]] = {}
+
+    def resume(self) -> None:
+        """Take over what an earlier call measured in this folder with the same packages and number of episodes."""
+        path = self.folder.path / MEASURED
+        if not path.exists():
+            return
+        with damage(str(path), "is damaged", "delete it"):
+            table = read_json(path)
+            if table["made"] == self._made():
+                self.screened_within = {int(step): float(value) for step, value in table["screened"].items()}
+                self.measured = {int(step): dict(row) for step, row in table["measured"].items()}
+
+    def _save(self) -> None:
+        table = {"made": self._made(), "screened": self.screened_within, "measured": self.measured}
+        write_json(self.folder.path / MEASURED, table)
+
+    def _made(self) -> dict[str, Any]:
+        episodes = self.folder.recipe.measure.rung_episodes
+        return {name: versions()[name] for name in ("mujoco", "gymnasium", "numpy")} | {"episodes": episodes}
 
     def measure(self, step: int) -> float:
         """Return the mean return of a policy over the recipe's `rung_episodes`."""
@@ -73,12 +95,14 @@ class RungEvaluator:
                 stream = (int(Purpose.MEASURE), step, int(deterministic))
                 row |= summary(self.run(policy, stream, count, deterministic), prefix)
             self.measured[step] = row
-            print(
-                f"offbench: policy of step {step:,}: return {row['return']:.1f} over {count} episodes",
-                file=sys.stderr,
-                flush=True,
-            )
+            self._save()
+            _say(f"policy of step {step:,}: return {row['return']:.1f} over {count} episodes")
         return self.measured[step]["return"]
+
+    def screen(self, step: int) -> float:
+        """Return the mean return of a policy within a segment over the recipe's few screening episodes."""
+        policy, stream = load_policy(self.folder.policy(step)), (int(Purpose.RUNG), step, 0)
+        return summary(self.run(policy, stream, self.folder.recipe.sac.rung_episodes))["return"]
 
     def run(self, policy: Policy, stream: tuple[int, ...], count: int, deterministic: bool = False) -> list[Outcome]:
         """Play evaluation episodes."""
@@ -88,10 +112,12 @@ class RungEvaluator:
         return outcomes
 
     def estimate(self, step: int) -> float:
-        """Return the return of a rung, as measured, or as screened if it was not measured."""
+        """Return the return of a policy, as measured, or as screened if it was not measured."""
         if step == 0:
             return -math.inf  # before training
-        return self.measured[step]["return"] if step in self.measured else self.screened[step]["stochastic_return"]
+        if step in self.measured:
+            return self.measured[step]["return"]
+        return self.screened[step]["stochastic_return"] if step in self.screened else self.screened_within[step]
 
     def expert(self) -> int:
         """Return the best rung of the second half by measured return."""
@@ -107,16 +133,17 @@ class RungEvaluator:
             # measure only what its screening interval says might lie there
             if self.screened[step]["stochastic_high"] >= target and target <= self.measure(step) <= most:
                 return step
-            if (between := self._between(before, step, target, most)) is not None:
-                return between
+            if self._crosses(before, step, target, most):
+                half = (most - target) / 2
+                if (found := self._first_close(self._screen_between(before, step), target + half, half)) is not None:
+                    return found
         return self.nearest(target, most - target, early)
 
     def nearest(self, target: float, close: float, among: Iterable[int] | None = None) -> int:
         """Return the policy whose return lies nearest `target`, as measured.
 
-        The few episodes that screened the rungs say where to look: the most promising are measured in turn,
-        until one proves to lie within `close` or nothing that was not measured looks nearer. If none does, the
-        policies between neighboring rungs on either side of `target` are measured, by halving.
+        If no rung lies within `close` of it, the policies between neighboring rungs on either side of `target` are
+        candidates too.
 
         Args:
             target: the wanted return.
@@ -124,40 +151,46 @@ class RungEvaluator:
             among: the rungs to choose from, with the policies between them (default: all).
         """
         steps = sorted(self.screened if among is None else among)
-        for _ in range(LOOKS):
+        if (found := self._first_close(steps, target, close)) is not None:
+            return found
+        candidates = list(steps)
+        crossings = (pair for pair in pairwise([0, *steps]) if self._crosses(*pair, target - close, target + close))
+        for pair in list(itertools.islice(crossings, CROSSINGS)):
+            candidates += self._screen_between(*pair)
+            if (found := self._first_close(candidates, target, close)) is not None:
+                return found
+        return min((s for s in candidates if s in self.measured), key=lambda step: abs(self.measure(step) - target))
+
+    def _first_close(self, steps: Sequence[int], target: float, close: float) -> int | None:
+        """Measure the most promising policies in turn; return the first within `close` of `target`, if one is.
+
+        The few episodes that screened them say where to look. It ends after LOOKS, or when no policy that was not
+        measured looks nearer than those that were.
+        """
+        for _ in range(LOOKS if steps else 0):
             step = min(steps, key=lambda step: abs(self.estimate(step) - target))
-            if step in self.measured:
-                break
+            measured = step in self.measured
             if abs(self.measure(step) - target) <= close:
                 return step
-        low, high = target - close, target + close
-        crossings = [pair for pair in pairwise([0, *steps]) if self._opposite(*pair, low, high) and self._kept(*pair)]
-        for pair in crossings[:CROSSINGS]:
-            if (between := self._between(*pair, low, high)) is not None:
-                return between
-        candidates = [step for step in self.measured if step in steps or (step in self.within and step < steps[-1])]
-        return min(candidates, key=lambda step: abs(self.measure(step) - target))
-
-    def _between(self, first: int, last: int, low: float, high: float) -> int | None:
-        """Return a policy between two rungs that returns `low` to `high`, if halving leads to one."""
-        if not self._opposite(first, last, low, high):
-            return None
-        rises = self.estimate(first) < low
-        while kept := self._kept(first, last):
-            middle = kept[len(kept) // 2]
-            if low <= self.measure(middle) <= high:
-                return middle
-            first, last = (middle, last) if (self.measure(middle) < low) == rises else (first, middle)
+            if measured:
+                break
         return None
 
-    def _kept(self, first: int, last: int) -> list[int]:
-        """Return the steps of the policies that were kept between two rungs."""
-        return [step for step in self.within if first < step < last]
-
-    def _opposite(self, first: int, last: int, low: float, high: float) -> bool:
-        """Return whether one of two rungs returns less than `low` and the other more than `high`."""
+    def _crosses(self, first: int, last: int, low: float, high: float) -> bool:
+        """Return whether `low` to `high` lies between the returns of two rungs that have policies between them."""
         less, more = sorted((self.estimate(first), self.estimate(last)))
-        return less < low and high < more
+        return less < low and high < more and any(first < step < last for step in self.within)
+
+    def _screen_between(self, first: int, last: int) -> list[int]:
+        """Screen the policies kept between two rungs; return their steps."""
+        steps = [step for step in self.within if first < step < last]
+        new = [step for step in steps if step not in self.screened_within]
+        if new:
+            _say(f"screening {len(new)} policies between steps {first:,} and {last:,}")
+        for step in new:
+            self.screened_within[step] = self.screen(step)
+            self._save()
+        return steps
 
 
 def check_output_folder(out: Path) -> Path:
@@ -189,6 +222,7 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
     with Rollouts(spec, workers) as rollouts:
         evaluator = RungEvaluator(folder, rows, [s for s in folder.policy_steps() if s <= steps], rollouts)
         episodes = folder.recipe.measure.reference_episodes
+        evaluator.resume()
         references = {"random": random_reference(folder.recipe, folder.seed, rollouts)}
         expert = evaluator.expert()
         policy = load_policy(folder.policy(expert))
@@ -276,9 +310,14 @@ def _table(
         int(row["step"]): {key.removeprefix("stochastic_"): value for key, value in row.items()} for row in rows
     }
     times = [row["hours"] for row in rows]
-    for step in sorted(screened.keys() | evaluator.measured.keys()):
+    measured = {step for step in evaluator.measured if step <= max(screened)}
+    for step in sorted(screened.keys() | measured):
         hours = round(float(np.interp(step, list(screened), times)), 4)
         values: dict[str, Any] = {"step": step, "hours": hours, **screened.get(step, {})}
         values |= evaluator.measured.get(step, {})
         values |= {"role": roles.get(step, ""), "policy": folder.policy(step).name if step in roles else ""}
         yield [values[key] for key in COLUMNS]
+
+
+def _say(line: str) -> None:
+    print(f"offbench: {line}", file=sys.stderr, flush=True)

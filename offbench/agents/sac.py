@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import sys
 import time
 import warnings
@@ -53,7 +54,8 @@ from offbench.rollouts.policy import Policy
 from offbench.rollouts.rollouts import MEASURES, Rollouts, summary
 
 SCREENED = ("step", "hours", *(f"{how}_{m}" for how in ("stochastic", "deterministic") for m in MEASURES), "episodes")
-POLICIES = 20  # of a segment, its rung included
+POLICIES = 100  # of a segment at most, its rung included,
+POLICY_BYTES = 6_000_000  # and as many as fit in this: 20 of hopper's
 FAR_APART = 0.05  # of the range of returns so far: half the distance between the rungs of a ladder
 STEP_WORK = 0.02  # time of an environment step, in gradient steps: for the time left
 PROBE = 1.0  # seconds at most that the estimate of a training's time takes
@@ -221,7 +223,9 @@ def _train_segment(folder: TrainingFolder, model: SAC, progress: Progress, stops
     settings = folder.recipe.sac
     start = model.num_timesteps // settings.segment * settings.segment
     end, cycle = start + settings.segment, settings.cycle()[0] * settings.envs
-    keep_every = max(settings.segment // cycle // POLICIES, 1) * cycle
+    keep_every = cycle * math.ceil(
+        settings.segment / cycle / min(POLICIES, max(POLICY_BYTES // _actor_bytes(model), 1))
+    )
     if model.num_timesteps == start:
         _start_segment(folder, model, start)
     fraction = min(start / settings.steps, 1.0)
@@ -236,6 +240,10 @@ def _train_segment(folder: TrainingFolder, model: SAC, progress: Progress, stops
             _export(folder, model).save(folder.policy(step))
         progress.to(step, work=_work(settings, step))
     return True
+
+
+def _actor_bytes(model: SAC) -> int:
+    return sum(parameter.nbytes for parameter in model.policy.actor.parameters())
 
 
 def _end_segment(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,9 +12,12 @@ from typing import Any
 import pytest
 
 from offbench.agents.build_ladder import RungEvaluator
-from offbench.agents.ladder import Ladder, Rung, read_ladder
+from offbench.agents.ladder import Ladder, Rung, folder_of, read_ladder
+from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common.errors import OffbenchError
 from offbench.data.levels import Part, parse_level, parse_mix, shares
+from offbench.envs.recipes import load_recipe
+from offbench.rollouts.rollouts import Outcome
 
 
 def evaluator(
@@ -21,7 +27,7 @@ def evaluator(
 
     Args:
         returns: of the rungs.
-        within: returns of policies within segments, by step.
+        within: returns of policies within segments, by step; screening says the same.
 
     Returns:
         The evaluator, and the steps that it measures, as it does.
@@ -41,6 +47,8 @@ def evaluator(
         return true[step]
 
     rungs.measure = measure  # type: ignore[method-assign]
+    rungs.screen = true.__getitem__  # type: ignore[method-assign]
+    rungs._save = lambda: None  # type: ignore[method-assign]
     return rungs, measured
 
 
@@ -65,11 +73,15 @@ def test_rungs_that_cannot_be_medium_are_not_measured() -> None:
 
 
 def test_where_the_return_leaps_over_the_band_medium_is_a_policy_within_the_segment() -> None:
-    """Between the rungs of steps 20 and 30 the return passes the band at step 26; halving gets there by 25, 28, 27."""
-    within = dict(zip(range(21, 30), [11.0, 12, 13, 15, 20, 40, 60, 70, 90], strict=True))
+    """The most promising as screened, as long as they measure well."""
+    within = dict(zip(range(21, 30), [11.0, 90, 13, 15, 70, 40, 60, 20, 90], strict=True))
     rungs, measured = evaluator([0, 10, 95, 40, 100], within)
     assert rungs.medium(100 / 3, 45, 50) == 26
-    assert measured == [30, 25, 28, 27, 26]
+    assert measured == [30, 26]
+    rungs, measured = evaluator([0, 10, 95, 40, 100], within)
+    rungs.screen = {**within, 28: 39.0}.__getitem__  # type: ignore[method-assign]
+    assert rungs.medium(100 / 3, 45, 50) == 26
+    assert measured == [30, 28, 26]
 
 
 def test_without_a_policy_in_the_band_within_the_segment_the_search_continues() -> None:
@@ -88,6 +100,18 @@ def test_a_return_that_the_rungs_leap_over_is_found_within_a_segment() -> None:
     assert rungs.nearest(50, close=2.5) == 25
     rungs, _ = evaluator([70, 80, 90], {2: 5.0, 4: 12.0, 7: 50.0})
     assert rungs.nearest(10, close=2.5) == 4, "before the first rung"
+
+
+def test_policies_within_segments_are_left_alone_where_a_rung_fits() -> None:
+    rungs, measured = evaluator([0, 10, 59, 98, 100], {15: 40.0, 35: 60.0})
+    assert rungs.nearest(60, close=2.5) == 30
+    assert not rungs.screened_within
+    assert measured == [30]
+
+
+def test_a_return_that_no_policy_has_gets_the_nearest() -> None:
+    rungs, _ = evaluator([0, 10, 95, 98], {22: 12.0, 25: 45.0, 27: 80.0})
+    assert rungs.nearest(60, close=2.5) == 25
 
 
 def test_the_nearest_of_some_rungs_is_not_one_after_them() -> None:
@@ -142,8 +166,6 @@ def test_shares_add_up() -> None:
 
 @pytest.mark.parametrize("fault", ["csv", "json", "role"])
 def test_a_damaged_ladder_is_said(tiny: tuple[str, str], home: Path, fault: str) -> None:
-    import shutil
-
     folder = home / "ladder"
     shutil.copytree(Path(tiny[1]) / "tiny" / "seed-0" / "ladder", folder)
     assert read_ladder(folder) is not None
@@ -157,3 +179,49 @@ def test_a_damaged_ladder_is_said(tiny: tuple[str, str], home: Path, fault: str)
 
 def test_no_ladder_is_no_error(home: Path) -> None:
     assert read_ladder(home) is None
+
+
+def test_a_build_that_was_interrupted_measures_nothing_again(tiny: tuple[str, str], home: Path) -> None:
+    """With another number of episodes, or another simulator, everything is measured again."""
+    recipe = load_recipe(tiny[0])
+    source = TrainingFolder(recipe, 0, folder_of(recipe, 0, Path(tiny[1])))
+    folder = TrainingFolder(recipe, 0, home / "training")
+    shutil.copytree(source.path, folder.path, ignore=shutil.ignore_patterns("ladder"))
+    rows = read_rungs(folder.rungs)
+    (folder.path / "measured.json").unlink()
+
+    class PlayedError(Exception):
+        pass
+
+    class Counting:
+        """Answers the first two evaluations (a policy is measured by two), and is interrupted at the third."""
+
+        calls = 0
+
+        def outcomes(self, *_: Any) -> Future[list[Outcome]]:
+            self.calls += 1
+            if self.calls > 2:
+                raise PlayedError
+            future: Future[list[Outcome]] = Future()
+            future.set_result([Outcome(30.0 + i, 9) for i in range(8)])
+            return future
+
+    def evaluator_of(folder: TrainingFolder) -> RungEvaluator:
+        return RungEvaluator(folder, rows, folder.policy_steps(), Counting())  # type: ignore[arg-type]
+
+    first = evaluator_of(folder)
+    with pytest.raises(PlayedError):
+        first.expert()
+    again = evaluator_of(folder)
+    again.resume()
+    assert again.measured == first.measured
+    assert len(again.measured) == 1
+    assert again.measure(next(iter(again.measured))) == 33.5
+    assert again.rollouts.calls == 0  # type: ignore[attr-defined]
+    more = replace(recipe, measure=replace(recipe.measure, rung_episodes=9))
+    other = evaluator_of(replace(folder, recipe=more))
+    other.resume()
+    assert not other.measured
+    (folder.path / "measured.json").write_text("{")
+    with pytest.raises(OffbenchError, match=r"measured\.json is damaged"):
+        again.resume()
