@@ -28,7 +28,7 @@ from offbench.envs.trust import check_code
 
 WHAT_MATTERS = ("id", "kwargs", "max_episode_steps")  # with the contact margins, what makes two specs the same
 LARGEST_BOUND = 1e6  # of actions; what has larger ones, such as float32's largest number, has none
-LONGEST = 50_000  # steps that an episode may take in an environment without a time limit
+LONGEST = 20_000  # steps that an episode may take in an environment without a time limit
 LARGEST_LIMIT = 1_000_000  # a time limit beyond this is none
 ELSEWHERE = "give `offbench train` or `offbench evaluate` an --env RECIPE"
 
