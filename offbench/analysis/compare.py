@@ -83,7 +83,7 @@ class Comparison:
             *self._pair_lines(),
             "",
             f"mean difference             {found.difference.value:+.1f} {found.difference.span()}".rstrip(),
-            f"standardised                {effect} (over the deviation of the {found.pairs} paired differences)",
+            f"standardized                {effect} (over the deviation of the {found.pairs} paired differences)",
             f"probability of improvement  {percent.value:.0f}% {percent.span()}".rstrip(),
             f"sign-flip test              p = {found.p:.3g}",
         ]

@@ -12,7 +12,7 @@ from typing import Any, NoReturn, TextIO
 from offbench.cli import data, results, tools, training
 from offbench.cli.arguments import Command, Parser
 from offbench.common.errors import unknown
-from offbench.common.terminal import labelled
+from offbench.common.terminal import labeled
 from offbench.common.text import printable
 from offbench.training.registry import failure
 
@@ -130,7 +130,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt as stop:
         resume = "; rerun the same command to resume from the last checkpoint, if there is one"
         print(file=sys.stderr)
-        labelled("offbench", f"stopped{resume if _command(words) in RESUMED else ''}", "bold yellow")
+        labeled("offbench", f"stopped{resume if _command(words) in RESUMED else ''}", "bold yellow")
         sys.exit(143 if isinstance(stop, Terminated) else 130)
     except BrokenPipeError:  # the reader of a pipe (`| head`) has left
         _discard_output()
@@ -138,7 +138,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(0)
     except Exception as error:
         _discard_output()
-        labelled("offbench", printable(" ".join(failure(error).split())), "bold red")
+        labeled("offbench", printable(" ".join(failure(error).split())), "bold red")
         sys.exit(2)
 
 

@@ -41,7 +41,7 @@ def say(line: str, style: str = "", *, stream: TextIO | None = None) -> None:
         print(line, file=stream, flush=True)
 
 
-def labelled(label: str, text: str, style: str) -> None:
+def labeled(label: str, text: str, style: str) -> None:
     """Print `label: text` to stderr, the label styled on a terminal."""
     if is_terminal(sys.stderr):
         from rich.text import Text
@@ -53,12 +53,12 @@ def labelled(label: str, text: str, style: str) -> None:
 
 def hint(*words: str) -> None:
     """Print the command to run next to stderr, quoted so that it can be pasted."""
-    labelled("next", shlex.join(words), "bold green")
+    labeled("next", shlex.join(words), "bold green")
 
 
 def note(text: str) -> None:
     """Print something worth knowing to stderr."""
-    labelled("note", text, "bold cyan")
+    labeled("note", text, "bold cyan")
 
 
 def print_table(

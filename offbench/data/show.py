@@ -71,7 +71,7 @@ class Summary:
 
 
 def show(dataset_id: str) -> Summary:
-    """Summarise a local Minari dataset with Box spaces.
+    """Summarize a local Minari dataset with Box spaces.
 
     Raises:
         OffbenchError: no such dataset, or it cannot be read.

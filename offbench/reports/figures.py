@@ -1,7 +1,7 @@
 """The report's figures: learning curves, final scores, IQM, performance profiles, beta and |Q| over training.
 
 A figure is drawn once and kept three ways: PNG and SVG files with a legend, and an SVG for the page without one
-(the page has its own), whose ink is the page's text colour so that it reads on light and dark.
+(the page has its own), whose ink is the page's text color so that it reads on light and dark.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from offbench.analysis.results import REFERENCES, Entry, Results, Task
 from offbench.analysis.statistics import Estimate, Scores, curve, iqm, profile
 from offbench.common.text import compact
 
-INK = "#21252b"  # text and axes; the page replaces it by its own text colour
+INK = "#21252b"  # text and axes; the page replaces it by its own text color
 GRID = "#8b93a0"
-# read on white and on near-black, and by the colour-blind (after Okabe and Ito)
+# read on white and on near-black, and by the color-blind (after Okabe and Ito)
 COLORS = ("#2f7fc1", "#d0700f", "#1c9a72", "#c2588f", "#8a6fd1", "#b58a00", "#d1495b", "#6b7785")
 STYLES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)))
 SIZE = (4.4, 2.9)
@@ -58,7 +58,7 @@ class Figure:
 
 
 def lines(methods: Sequence[Method]) -> dict[Method, Line]:
-    """Return colour and dashes of each method; sixteen methods and more repeat colours with other dashes."""
+    """Return color and dashes of each method; sixteen methods and more repeat colors with other dashes."""
     return {
         method: Line(method.label, COLORS[i % len(COLORS)], STYLES[(i + i // len(COLORS)) % len(STYLES)])
         for i, method in enumerate(methods)
@@ -279,7 +279,7 @@ def _saved(fig: Any, kind: str) -> bytes:
 
 
 def _for_page(svg: str, name: str) -> str:
-    """Return an SVG to stand in the page: ids of its own, the page's text colour and font, no fixed size."""
+    """Return an SVG to stand in the page: ids of its own, the page's text color and font, no fixed size."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>|<style .*?</style>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", svg)

@@ -63,7 +63,7 @@ class Policy:
     Attributes:
         kind: one of KINDS.
         layers: (weight [in, out], bias [out]) of each linear layer, float32.
-        observation_mean, observation_std: [obs], the normalisation before the first layer.
+        observation_mean, observation_std: [obs], the normalization before the first layer.
         low, high: [act], the bounds of the environment's action space.
         env_id: the environment it was trained for.
         origin: provenance, anything JSON: algorithm, training step, dataset, seed.
@@ -273,7 +273,7 @@ def _check_shapes(p: Policy) -> None:
         raise ValueError("it holds NaN or infinite numbers")
     dim, act = p.observation_mean.shape, p.low.shape
     if any(a.ndim != 1 for a in arrays[:4]) or dim != p.observation_std.shape or act != p.high.shape:
-        raise ValueError("the shapes of bounds or normalisation do not agree")
+        raise ValueError("the shapes of bounds or normalization do not agree")
     check_networks(p, dim[0], act[0])
     if p.kind != "uniform" and ((p.observation_std <= 0).any() or (p.high <= p.low).any()):
         raise ValueError("a std is not positive, or bounds are out of order")
