@@ -79,7 +79,7 @@ def prepare(
         variant
         for entry in read.entries
         for variant in specs_of(
-            entry.algorithm, entry.settings, datasets, entry.times, Path(runs), precision, entry.label
+            entry.algorithm, entry.settings, datasets, entry.times, Path(runs), precision, label=entry.label
         )
     ]
     if len({(variant[0].algorithm, variant[0].variant) for variant in variants}) < len(variants):
