@@ -118,9 +118,9 @@ def _train(folder: TrainingFolder, steps: int) -> None:
             progress.skip(model.num_timesteps, _work(settings, model.num_timesteps))
             progress.say(_plan(recipe, pace, model.num_timesteps, steps))
             while model.num_timesteps < steps and not stops:
-                start = time.monotonic()
+                start = time.process_time()  # of one thread: what else runs on the machine does not count
                 finished = _train_segment(folder, model, progress, stops)
-                seconds += time.monotonic() - start
+                seconds += time.process_time() - start
                 if finished:
                     rows.append(_end_segment(folder, model, rollouts, rows, seconds))
                     progress.to(
