@@ -243,12 +243,13 @@ _OUT: dict[Any, tuple[Callable[..., Any], list[str]] | None] = {}  # the variant
 def _in_place(func: Any, args: Any, kwargs: Any, result: Any) -> Call:
     """Return the call that does the same and writes into `result`."""
     outputs = [result] if isinstance(result, Tensor) else list(result)
-    if func not in _OUT:
+    whole = all(isinstance(output, Tensor) for output in outputs)  # a backward pass has None where nobody asks
+    if whole and func not in _OUT:
         _OUT[func] = next(
             (variant for variant in _variants(func, len(outputs)) if _agrees(variant, args, kwargs, outputs)),
             None,
         )
-    found = _OUT[func]
+    found = _OUT[func] if whole else None
     if found is not None:
         function, names = found
         if len(names) == 1 or function is not getattr(torch, func.overloadpacket.__name__, None):
@@ -258,7 +259,8 @@ def _in_place(func: Any, args: Any, kwargs: Any, result: Any) -> Call:
     def copy(*arguments: Any, **named: Any) -> None:
         again = func(*arguments, **named)
         for output, new in zip(outputs, [again] if isinstance(again, Tensor) else again, strict=True):
-            output.copy_(new)
+            if output is not None:
+                output.copy_(new)
 
     return copy, args, kwargs
 

@@ -40,6 +40,9 @@ CASES: list[tuple[str, dict[str, str]]] = [
     ("bdb", {}),
     ("bdb_plus", {"beta": "learned", "critic_penalty": "cql", "cloning_steps": "20"}),
     ("bdb_plus", {"critics": "3", "beta_scope": "batch", "uncertainty": "relative"}),
+    ("iql", {"decay_steps": "50"}),
+    ("rebrac", {}),
+    ("bear", {"warm_up_steps": "20", "vae_hidden": "16", "target_samples": "2", "match_samples": "2"}),
     ("cql", {"bc_steps": "20", "num_actions": "3"}),
     ("cql", {"bc_steps": "0", "lagrange": "true", "num_actions": "3"}),
 ]

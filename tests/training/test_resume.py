@@ -28,6 +28,9 @@ EXTRA: dict[str, dict[str, Any]] = {
     "bdb": {},
     "bdb_plus": {"critic_penalty": "cql", "penalty_actions": 3, "cloning_steps": 150, "beta": "learned"},
     "bc": {},
+    "iql": {"decay_steps": 1000},
+    "rebrac": {},
+    "bear": {"vae_hidden": (16, 16), "target_samples": 3, "match_samples": 2, "warm_up_steps": 150, "eval_samples": 2},
     "cql": {"num_actions": 2, "bc_steps": 150, "eval_samples": 3},
 }
 
