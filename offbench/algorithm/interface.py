@@ -161,6 +161,14 @@ class Algorithm(Generic[C]):
         kind = "tanh" if actor.sizes[-1] == self.action_dim else "squashed_gaussian"
         return PolicyParts(kind, actor.layers(run), activation=actor.activation)
 
+    def q_values(self, observations: Tensor, actions: Tensor) -> Tensor | None:
+        """Return Q(s, a) [runs, batch] for the similar score, None if the algorithm has no critic.
+
+        By default that of the network `critic`, the first of an ensemble.
+        """
+        critic = getattr(self, "critic", None)
+        return critic.frozen(observations, actions, members=0) if isinstance(critic, Network) else None
+
     @property
     def learned(self) -> dict[str, Learned]:
         """Everything that a checkpoint keeps: networks, targets and parameters among the attributes, by name."""

@@ -144,6 +144,11 @@ class Entry:
         return {trained.state for trained in self.runs}
 
     @property
+    def of_one_code(self) -> bool:
+        """Whether the same code of the algorithm trained all runs, as far as they say: earlier versions did not."""
+        return len({tuple(trained.config.code.items()) for trained in self.runs if trained.config.code}) < 2
+
+    @property
     def evaluations(self) -> int:
         """The fewest evaluations behind a run's score."""
         return min(len(trained.window) for trained in self.runs)

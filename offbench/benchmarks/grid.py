@@ -4,7 +4,8 @@ datasets = ["hopper-medium-v0", {id = "mine-v0", env = "./my-env.toml", level = 
 seeds = 5                          # that many, or a list
 steps = 1_000_000                  # with eval_every and eval_episodes as in `offbench train`
 [[algorithms]]
-name = "bdb"                       # then its settings; a list makes a variant per value (hidden: a list of lists)
+name = "bdb"                       # or "./my_algo.py:ReBRAC"
+                                   # then its settings; a list makes a variant per value (hidden: a list of lists)
 beta = [0.25, "adaptive"]
 label = "BDB"                      # its name in tables, if the settings are one variant
 steps = 500_000                    # optional: its own seeds, steps, eval_every and eval_episodes
@@ -105,7 +106,7 @@ def load_grid(name: str) -> Grid:
     return Grid(
         path.stem,
         tuple(_source(value, path.parent, where) for value in sources),
-        tuple(_entry(value, times, where) for value in entries),
+        tuple(_entry(value, times, path.parent, where) for value in entries),
     )
 
 
@@ -144,7 +145,7 @@ def _source(value: Any, folder: Path, where: str) -> Source:
     return Source(value, env, level)
 
 
-def _entry(value: Any, times: Times, where: str) -> Entry:
+def _entry(value: Any, times: Times, folder: Path, where: str) -> Entry:
     if not isinstance(value, dict) or not isinstance(value.get("name"), str):
         raise OffbenchError(f"{where}: each of [[algorithms]] needs a name")
     own = {field.name for field in dataclasses.fields(Times)}
@@ -154,4 +155,7 @@ def _entry(value: Any, times: Times, where: str) -> Entry:
     if not isinstance(label, str) or len(label) > LONGEST_LABEL or not label.isprintable():
         raise OffbenchError(f"{entry}: label must be a line of at most {LONGEST_LABEL} characters, not {label!r:.80}")
     settings = {key: item for key, item in value.items() if key not in own and key not in ("name", "label")}
-    return Entry(value["name"], settings, changed, label)
+    name = value["name"]
+    beside = folder / name  # an algorithm's file may be named from the grid's folder
+    file = ".py" in name and beside.with_suffix(".py").is_file()
+    return Entry(str(beside) if file else name, settings, changed, label)

@@ -15,7 +15,7 @@ from offbench.common.terminal import hint, note
 
 OPTIMIZATION = ("batch_size", "discount", "tau", "policy_freq", "normalize")  # settings that every method has
 
-SWITCHES = ("--tensorboard", "--trust")  # flags of `train` without a value: the algorithm may follow them
+SWITCHES = ("--tensorboard", "--trust", "--fresh")  # flags of `train` without a value: the algorithm may follow them
 
 
 def train_arguments(parser: Parser, words: list[str]) -> None:
@@ -24,7 +24,8 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
 
     parser.usage = "offbench train ALGO --dataset ID ... [options]"
     algorithm, named = _algorithm(words)
-    argument = parser.add_argument("algorithm", metavar="ALGO", help=f"one of {', '.join(algorithm_names())}")
+    names = ", ".join(algorithm_names())
+    argument = parser.add_argument("algorithm", metavar="ALGO", help=f"one of {names}, or ./FILE.py:CLASS")
     completed(argument, algorithm_names)
     dataset = parser.add_argument("--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets")
     completed(dataset, local_datasets)
@@ -39,6 +40,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     parser.add_argument("--eval-every", type=whole, default=5_000, help="updates between evaluations (default: 5,000)")
     parser.add_argument("--eval-episodes", type=whole, default=10, help="episodes per evaluation (default: 10)")
     _machine(parser)
+    parser.add_argument("--fresh", action="store_true", help="delete what the run folders hold and train anew")
     parser.add_argument("--tensorboard", action="store_true", help="write event files into each run's folder")
     parser.add_argument("--wandb", metavar="PROJECT", help="log to a Weights & Biases project")
     if algorithm is None:
@@ -72,9 +74,9 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
 def _settings(parser: Parser, algorithm: str) -> type:
     """Add an algorithm's own settings, in groups. Returns its Config."""
     from offbench.common.settings import fields
-    from offbench.training.registry import load_algorithm
+    from offbench.training.registry import load_algorithm, use
 
-    config = load_algorithm(algorithm).Config
+    config = load_algorithm(use(algorithm)).Config
     titles = {
         "method": f"settings of {algorithm}",
         "optimization": f"optimization of {algorithm}",

@@ -111,6 +111,7 @@ def column_steps(entries: Sequence[Entry]) -> str:
 def _score_cell(entry: Entry, below: str, detail: str, more: str) -> Cell:
     found = mean_std(entry.scores)
     marks = [mark for state, mark in (("unfinished", " †"), ("diverged", " ‡")) if state in entry.states]
+    marks += [] if entry.of_one_code else [" §"]
     text = plus_minus(found) + "".join(marks)
     return Cell(text if entry.task.reference else f"return {text}", found[0], below, detail=detail, more=more)
 
@@ -148,6 +149,8 @@ def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
         notes.insert(1, "‡ a run became NaN or infinite and stopped: the number is of its evaluations before that.")
     if "unfinished" in states:
         notes.insert(1, "† training is not finished: the number is of the steps done so far and may still change.")
+    if not all(entry.of_one_code for entry in entries):
+        notes.insert(1, "§ the runs were trained by different code of the algorithm, as their config.json says.")
     if torn := _torn(entries):
         notes.append(
             f"The datasets of {', '.join(torn)} were recorded with different references: their scores are on "

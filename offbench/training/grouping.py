@@ -26,6 +26,7 @@ from offbench.envs.recipes import d4rl_reference
 from offbench.envs.same_physics import warn_other_physics
 from offbench.training.devices import Machine, stack_size
 from offbench.training.run import RunConfig
+from offbench.training.source_code import code_of
 from offbench.training.spec import Job, RunSpec, settings_json
 
 Datasets = Mapping[str, Transitions]
@@ -186,5 +187,6 @@ def _run_config(spec: RunSpec, data: Transitions, device: str, command: str) -> 
         env_id=data.env_id,
         env_spec=data.env_spec,
         command=command.encode("utf-8", "backslashreplace").decode(),  # a path may hold bytes that are not UTF-8
+        code=code_of(spec.algorithm),
         **made_with(device, spec.precision),
     )

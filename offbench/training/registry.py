@@ -1,15 +1,23 @@
-"""Algorithms by name: ours and third parties', through the entry-point group `offbench.algos`."""
+"""Algorithms by name: ours and third parties', through the entry-point group `offbench.algos`, and a user's own.
+
+A user's own algorithm is a class, or a file `./my_algo.py:ReBRAC`; `use` gives it the name of its class. Processes
+started later find it by that name in $OFFBENCH_OWN_ALGORITHMS, as long as its module can be imported there.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib
 import importlib.metadata
+import json
 import os
+import re
 import sys
 import traceback
 import types
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, drawing_variable, unknown
@@ -19,6 +27,8 @@ if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
 
 GROUP = "offbench.algos"
+OWN = "OFFBENCH_OWN_ALGORITHMS"  # {name: "module:class"} as JSON, for the processes that this one starts
+_own: dict[str, type[Algorithm]] = {}  # this process's own algorithms
 
 
 NEEDED = ("batch_size", "normalize")  # settings that the training itself reads
@@ -81,13 +91,14 @@ def failure(error: Exception) -> str:
     frame = traceback.extract_tb(error.__traceback__)[-1]
     what = f"{type(error).__name__}: {error} (at {frame.filename}:{frame.lineno})"
     if algorithm:
-        return f"an error in the package {algorithm}: {what}; see the traceback above"
+        return f"an error in {algorithm}: {what}; see the traceback above"
     return f"this is a bug in offbench: {what}; please report it; {SHOW_TRACEBACK}"
 
 
 def _third_party(trace: types.TracebackType | None) -> str | None:
-    """Return the package of an algorithm, not offbench's own, that a traceback leads through."""
+    """Return the package or module of an algorithm, not offbench's own, that a traceback leads through."""
     packages = {point.module.partition(".")[0] for points in _entry_points().values() for point in points}
+    packages |= {kind.__module__.partition(".")[0] for kind in _own.values()} - {"__main__"}
     while trace is not None:
         package = str(trace.tb_frame.f_globals.get("__name__", "")).partition(".")[0]
         if package in packages - {"offbench"}:
@@ -97,14 +108,25 @@ def _third_party(trace: types.TracebackType | None) -> str | None:
 
 
 def load_algorithm(name: str) -> type[Algorithm]:
-    """Return an algorithm's class by name.
+    """Return an algorithm's class by its name, that of a package or one that `use` has returned.
+
+    A name may come from a run folder that was handed over, so no file is imported here.
 
     Raises:
         OffbenchError: it is unknown, two packages have one of that name, it does not import, or has no sound Config.
     """
+    if name in _own:
+        return _own[name]
     points = _entry_points()
     if name not in points:
-        raise unknown("algorithm", name, points)
+        known = json.loads(os.environ.get(OWN, "{}"))
+        if name not in known:
+            raise unknown("algorithm", name, points)
+        module, _, qualname = known[name].partition(":")
+        found: Any = importlib.import_module(module)
+        for part in qualname.split("."):
+            found = getattr(found, part)
+        return _own.setdefault(name, found)
     point, *others = points[name]
     if others:
         raise OffbenchError(f"two algorithms are named {name!r}: {point.value} and {others[0].value}; rename yours")
@@ -113,19 +135,94 @@ def load_algorithm(name: str) -> type[Algorithm]:
     except Exception as error:  # whatever its code raises
         why = f"{type(error).__name__}: {error}"
         raise OffbenchError(f"algorithm {name!r} ({point.value}) does not import: {why} ({SHOW_TRACEBACK})") from error
+    return _checked(kind, f"algorithm {name!r} ({point.value})")
+
+
+def use(algorithm: str | type) -> str:
+    """Return the name of an algorithm in folders, tables and `load_algorithm`.
+
+    Args:
+        algorithm: a registered name, a file `./my_algo.py:ReBRAC` (the class may be left out if it is the only
+            algorithm there), or a class.
+
+    Raises:
+        OffbenchError: no such file or class, no sound algorithm, or a name that another algorithm has.
+    """
+    if isinstance(algorithm, str) and not re.search(r"\.py(:|$)", algorithm):
+        return algorithm
+    kind = _from_file(algorithm) if isinstance(algorithm, str) else algorithm
+    name, value = kind.__name__, f"{kind.__module__}:{kind.__qualname__}"
+    for points in _entry_points().values():
+        for point in points:
+            if point.value == value:
+                return point.name
+    where = algorithm if isinstance(algorithm, str) else f"class {name}"
+    if name in _entry_points():
+        raise OffbenchError(f"{where}: an algorithm of a package is named {name!r} too; rename the class")
+    other = _own.get(name)
+    if other is not None and f"{other.__module__}:{other.__qualname__}" != value:
+        raise OffbenchError(
+            f"two algorithms are named {name!r}, in {other.__module__} and {kind.__module__}; rename one"
+        )
+    _own[name] = _checked(kind, where)
+    if not is_local(name):
+        os.environ[OWN] = json.dumps(json.loads(os.environ.get(OWN, "{}")) | {name: value})
+    return name
+
+
+def is_local(name: str) -> bool:
+    """Return whether an algorithm is a class that other processes cannot import: of a notebook, script or function."""
+    kind = _own.get(name)
+    return kind is not None and (kind.__module__ == "__main__" or "<locals>" in kind.__qualname__)
+
+
+def _from_file(reference: str) -> type[Algorithm]:
+    """Return the class that `path/my_algo.py:ReBRAC` names, importing the file as the module `my_algo`."""
+    from offbench.algorithm.interface import Algorithm
+
+    text, _, name = reference.rpartition(":") if reference.rpartition(":")[0].endswith(".py") else (reference, "", "")
+    path = Path(text).expanduser().resolve()
+    if not path.is_file():
+        raise OffbenchError(f"no algorithm file {text}")
+    if not path.stem.isidentifier():
+        raise OffbenchError(f"{text}: rename the file to what Python can import, such as my_algorithm.py")
+    if str(path.parent) not in sys.path:
+        sys.path.insert(0, str(path.parent))  # as Python does for a script, so that the file can import its neighbors
+    try:
+        module = importlib.import_module(path.stem)
+    except Exception as error:  # whatever its code raises
+        traceback.print_exception(error)
+        raise OffbenchError(
+            f"{text} does not import: {type(error).__name__}: {error}; see the traceback above"
+        ) from None
+    if Path(getattr(module, "__file__", None) or "").resolve() != path:
+        raise OffbenchError(f"{text}: Python has another module {path.stem!r}; rename the file")
+    kinds = {
+        key: value
+        for key, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, Algorithm) and value.__module__ == module.__name__
+    }
+    if name in kinds:
+        return kinds[name]
+    if name or len(kinds) != 1:
+        what = f"no algorithm {name!r}" if name else "several algorithms" if kinds else "no algorithm"
+        hint = f"; name one: {text}:{' or :'.join(kinds)}" if kinds else ""
+        raise OffbenchError(f"{text} has {what}{hint}")
+    return next(iter(kinds.values()))
+
+
+def _checked(kind: type, what: str) -> type[Algorithm]:
+    """Return a class if it is an algorithm that can train. Raises OffbenchError if not."""
     from offbench.algorithm.interface import Algorithm  # imports PyTorch, which those who ask for names do without
 
     if not (isinstance(kind, type) and issubclass(kind, Algorithm)):
-        raise OffbenchError(
-            f"algorithm {name!r} ({point.value}) must be a subclass of offbench.algorithm.Algorithm; "
-            "see docs/extending.md"
-        )
+        raise OffbenchError(f"{what} must be a subclass of offbench.algorithm.Algorithm; see docs/extending.md")
     config = getattr(kind, "Config", None)
     if not (isinstance(config, type) and dataclasses.is_dataclass(config)):
-        raise OffbenchError(f"algorithm {name!r} ({point.value}): Config must be a dataclass of settings")
+        raise OffbenchError(f"{what}: Config must be a dataclass of settings")
     for needed in NEEDED:
         if needed not in {field.name for field in dataclasses.fields(config)}:
-            raise OffbenchError(f"algorithm {name!r} ({point.value}): its Config lacks the setting {needed}")
+            raise OffbenchError(f"{what}: its Config lacks the setting {needed}")
     return kind
 
 

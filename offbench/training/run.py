@@ -15,6 +15,7 @@ import contextlib
 import csv
 import dataclasses
 import json
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +34,7 @@ from offbench.common.files import (
 )
 from offbench.common.settings import read_back
 from offbench.training.registry import current_settings
+from offbench.training.source_code import changes
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 FORMAT = "offbench-run-1"
@@ -68,6 +70,7 @@ class RunConfig:
         references: (random, expert) returns by name: `dataset`, its own, and `d4rl`, D4RL's constants.
         env_spec: the environment it is evaluated in, as EnvSpec JSON; None if the dataset names none.
         device, precision, versions, hardware: of the first session.
+        code: hashes of the algorithm's files (offbench.training.source_code); empty in runs of earlier versions.
         sessions: the later sessions that were trained with something else.
         label: the method's name in tables, if a grid gives one.
     """
@@ -90,6 +93,7 @@ class RunConfig:
     precision: str = ""
     versions: dict[str, Any] = field(default_factory=dict)
     hardware: dict[str, Any] = field(default_factory=dict)
+    code: dict[str, str] = field(default_factory=dict)
     sessions: tuple[Session, ...] = ()
     label: str = ""
 
@@ -186,6 +190,11 @@ class Run:
                 raise OffbenchError(
                     f"{self.folder} was started with {flag} {old}, not {new}; delete it or give another --runs"
                 )
+            if changed := changes(existing.code, config.code):
+                raise OffbenchError(
+                    f"{self.folder} was trained by other code of {config.algorithm}: {changed}; "
+                    "give --fresh to train it anew, or another --runs"
+                )
         elif any(self.folder.glob("checkpoint-*.safetensors")):
             raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
         else:
@@ -195,6 +204,18 @@ class Run:
                     write_json(self.config_path, {k: v for k, v in values.items() if k != "sessions" or v})
                     return
             self.claim(config)  # another process was faster
+
+    def clear(self) -> None:
+        """Delete what the folder holds, if it holds a run, so that it is trained anew."""
+        if self.config_path.exists():
+            with self.locked():
+                for path in self.folder.iterdir():
+                    if path.name == ".lock":
+                        continue
+                    if path.is_dir() and not path.is_symlink():
+                        shutil.rmtree(path)
+                    else:
+                        path.unlink()
 
     def begin(self, step: int, steps: int, made: Mapping[str, Any]) -> None:
         """Note in config.json that the run is trained from `step` to `steps`, and with what, if that has changed.

@@ -18,7 +18,7 @@ from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import sha256
 from offbench.common.settings import check, fields, setting
 from offbench.training.loggers import NOWHERE, Destinations
-from offbench.training.registry import load_algorithm
+from offbench.training.registry import load_algorithm, use
 from offbench.training.run import Run
 
 LONGEST = 255  # bytes of a file's name, on the usual file systems
@@ -39,7 +39,7 @@ class RunSpec:
     """One run that is to be trained.
 
     Attributes:
-        algorithm: its registered name.
+        algorithm: its name, as `load_algorithm` takes it.
         config: the algorithm's settings, an instance of its `Config`.
         dataset: the id of a local Minari dataset.
         steps: updates of the whole run.
@@ -121,7 +121,7 @@ class Job:
 
 
 def specs_of(
-    algorithm: str,
+    algorithm: str | type,
     settings: Mapping[str, Any],
     datasets: Sequence[str],
     times: Times,
@@ -133,6 +133,7 @@ def specs_of(
     """Return the runs of one algorithm on datasets: a tuple per combination of settings (variant).
 
     Args:
+        algorithm: a registered name, a file `./my_algo.py:ReBRAC`, or a class.
         settings: values by name; a list of values is varied.
         runs: the folder of all run folders.
         env_spec: the environment to evaluate in (EnvSpec JSON) instead of the datasets'.
@@ -141,7 +142,7 @@ def specs_of(
     Raises:
         OffbenchError: an unknown algorithm or setting, a bad value, or a label for several variants.
     """
-    variants = []
+    algorithm, variants = use(algorithm), []
     configs = configurations(load_algorithm(algorithm).Config, settings, algorithm)
     if label and len(configs) > 1:
         raise OffbenchError(

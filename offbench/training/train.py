@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from offbench.algorithm.interface import Algorithm
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
 from offbench.common.settings import build
@@ -21,14 +22,15 @@ from offbench.training.devices import Machine, pick_machine
 from offbench.training.grouping import check_datasets, group, load_datasets, pending
 from offbench.training.jobs import raise_first, run_jobs
 from offbench.training.loggers import NOWHERE, Destinations
-from offbench.training.registry import current_settings, load_algorithm
+from offbench.training.registry import current_settings, is_local, load_algorithm, use
 from offbench.training.run import Run
+from offbench.training.source_code import changes, code_of
 from offbench.training.spec import Job, RunSpec, Times, specs_of
 from offbench.training.stack import Stack
 
 
 def train(
-    algorithm: str,
+    algorithm: str | type[Algorithm],
     dataset: str | Sequence[str],
     *,
     env: str | None = None,
@@ -43,13 +45,14 @@ def train(
     runs: str | Path = "runs",
     tensorboard: bool = False,
     wandb: str | None = None,
+    fresh: bool = False,
     command: str = "",
     **settings: Any,
 ) -> list[Path]:
     """Train one algorithm on one or more datasets, or resume the runs from their newest checkpoints.
 
     Args:
-        algorithm: a registered name: td3_bc, bdb, cql, or a third party's.
+        algorithm: a registered name (td3_bc, bdb, cql, or a third party's), a file `./my_algo.py:ReBRAC`, or a class.
         dataset: one id of a local Minari dataset, or several.
         env: the recipe's name or file of the environment to evaluate in, instead of the one that the dataset names.
         seeds: one seed or several; a run's random numbers depend on its own seed alone.
@@ -63,6 +66,7 @@ def train(
         runs: the folder of all run folders.
         tensorboard: write TensorBoard event files into each run's folder `tensorboard`.
         wandb: a Weights & Biases project to show the runs in.
+        fresh: delete what the runs' folders hold and train anew, where the algorithm's code has changed since.
         command: what the user typed, for the run's config.json.
         settings: the algorithm's own (`offbench train bdb --help`); each also takes a list of values, e.g.
             `beta=[0.25, 0.5, "adaptive"]`, or `hidden=[(64, 64), (256, 256)]`.
@@ -84,7 +88,7 @@ def train(
     machine = pick_machine(device, workers, stack, precision)
     show = Destinations(tensorboard, wandb)
     show.check()
-    training = Training(specs, machine, command=command, show=show)
+    training = Training(specs, machine, command=command, show=show, fresh=fresh)
     if training.finished:
         total = f"{len(specs)} run{'s' if len(specs) > 1 else ''}"
         print(f"already finished: {training.finished} of {total}", file=sys.stderr)
@@ -103,18 +107,28 @@ class Training:
     Args:
         command: what the user typed, for config.json.
         show: live views of the training.
+        fresh: whether to delete what the runs' folders hold first.
 
     Raises:
         OffbenchError: a dataset is missing or damaged, or a run's folder holds another run.
     """
 
     def __init__(
-        self, specs: Sequence[RunSpec], machine: Machine, *, command: str = "", show: Destinations = NOWHERE
+        self,
+        specs: Sequence[RunSpec],
+        machine: Machine,
+        *,
+        command: str = "",
+        show: Destinations = NOWHERE,
+        fresh: bool = False,
     ) -> None:
         self.machine, self._command = machine, command
         self._datasets = load_datasets(specs)
         check_datasets(self._datasets)
         self._groups = [replace(job, show=show) for job in group(specs, self._datasets, machine)]
+        if fresh:
+            for spec in specs:
+                spec.run.clear()
         self.jobs = self.pending()
         self.diverged = [
             f"{spec.folder} has diverged before and is left as it is; delete it to try again"
@@ -149,7 +163,8 @@ class Training:
         jobs.sort(
             key=lambda job: job.work, reverse=True
         )  # a long one that starts last would run beside idle processes
-        return execute(jobs, self.machine.processes) if jobs else []
+        local = any(is_local(job.first.algorithm) for job in jobs)  # other processes cannot import the class
+        return execute(jobs, 1 if local else self.machine.processes) if jobs else []
 
 
 def _seed_list(seeds: int | Sequence[int]) -> tuple[int, ...]:
@@ -168,15 +183,22 @@ def _check_times(times: Times) -> None:
             raise OffbenchError(f"{name} must be a whole number from 1, not {value}")
 
 
-def restore(run: Run) -> Stack:
+def restore(run: Run, algorithm: str | type | None = None) -> Stack:
     """Return a run's learning state from its newest checkpoint, on the CPU.
 
+    Args:
+        algorithm: the run's algorithm, if no installed package has it: `./my_algo.py:ReBRAC`, or the class.
+
     Raises:
-        OffbenchError: no run, no checkpoint, or its dataset is gone or changed.
+        OffbenchError: no run, no checkpoint, its dataset is gone or changed, or its algorithm is another or unknown.
     """
     config = run.config()
+    if algorithm is not None and use(algorithm) != config.algorithm:
+        raise OffbenchError(f"{run.folder} is a run of {config.algorithm}, not of {use(algorithm)}")
     kind = load_algorithm(config.algorithm)
     recorded = current_settings(config.algorithm, config.settings, str(run.folder))
+    if changed := changes(config.code, code_of(config.algorithm)):
+        raise OffbenchError(f"{run.folder} was trained by other code of {config.algorithm}: {changed}")
     settings: Any = build(kind.Config, recorded, f"{run.config_path}: settings")
     data = transitions.load(config.dataset)
     if data.content != config.dataset_sha256:
