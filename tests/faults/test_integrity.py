@@ -119,6 +119,26 @@ def test_references_beyond_reason_are_damage(
     assert "references" in refusal(["normalize", "--runs", str(tmp_path)], capsys)
 
 
+def test_an_earlier_runs_precision_is_read_from_its_tf32(tmp_path: Path) -> None:
+    run = trained(tmp_path / "seed-0")
+    written = json.loads(run.config_path.read_text())
+    run.config_path.write_text(json.dumps(written | {"tf32": True, "sessions": [{"step": 100, "tf32": False}]}))
+    assert [session.precision for session in run.config().history] == ["tf32", "float32"]
+
+
+@pytest.mark.parametrize(
+    "change", [{"sessions": [3]}, {"sessions": {}}, {"sessions": None}, {"env_spec": "{"}, {"steps": 10**15}]
+)
+def test_a_config_of_other_types_is_damage(
+    tmp_path: Path, change: dict[str, object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = trained(tmp_path / "seed-0")
+    run.config_path.write_text(json.dumps(json.loads(run.config_path.read_text()) | change))
+    line = refusal(["normalize", "--runs", str(tmp_path)], capsys)
+    assert str(run.config_path) in line
+    assert "delete the run" in line
+
+
 def test_a_run_with_an_unreadable_config_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trained(tmp_path / "seed-0")
     (trained(tmp_path / "seed-1").folder / "config.json").write_text("{")

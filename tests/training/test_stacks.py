@@ -18,7 +18,7 @@ from offbench.cli.main import main
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
 from offbench.training.devices import pick_machine
-from offbench.training.jobs import train_job
+from offbench.training.jobs import run_jobs, train_job
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run
 from offbench.training.spec import Job, RunSpec, configurations
@@ -68,7 +68,7 @@ def test_a_deadline_within_a_training_changes_no_file(medium: str, home: Path) -
             assert (one.folder / name).read_bytes() == (other.folder / name).read_bytes(), name
 
 
-def test_stacks_are_cut_for_the_processes_and_by_size(medium: str) -> None:
+def test_runs_are_grouped_for_the_processes_and_by_size(medium: str) -> None:
     def sizes(count: int, processes: int, stack: int | str = "auto") -> list[int]:
         return [len(job.specs) for job in jobs_of(specs(medium, "runs", count, (100, 100)), processes, stack)]
 
@@ -101,7 +101,17 @@ def test_another_environment_makes_a_stack_of_its_own(medium: str, home: Path) -
     assert [{spec.dataset for spec in job.specs} for job in jobs_of(both, 1)] == [{medium}, {"longer-v0"}]
 
 
-def test_a_stack_that_goes_on_has_the_same_runs_as_before(medium: str) -> None:
+@pytest.mark.parametrize(("processes", "evaluators"), [(1, 0), (4, 3)])
+def test_one_job_has_the_other_processes_for_its_evaluations(
+    medium: str, processes: int, evaluators: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained: list[Job] = []
+    monkeypatch.setattr("offbench.training.jobs.train_job", lambda job, _: trained.append(job) or [])
+    assert run_jobs([Job(tuple(specs(medium, "runs", 2, (100, 100))), "cpu")], processes) == []
+    assert [job.workers for job in trained] == [evaluators]
+
+
+def test_a_job_that_resumes_has_the_same_runs_as_before(medium: str) -> None:
     """Of two stacks of two, one is done: the other is not split to fill the processes."""
     runs = specs(medium, "runs", 4, (200, 100))
     finish(jobs_of(runs, 2)[:1])
@@ -109,7 +119,7 @@ def test_a_stack_that_goes_on_has_the_same_runs_as_before(medium: str) -> None:
     assert [spec.seed for spec in job.specs] == [2, 3]
 
 
-def test_a_run_that_diverges_is_marked_and_the_others_go_on(medium: str) -> None:
+def test_a_run_that_diverges_is_marked_and_the_others_continue(medium: str) -> None:
     common: dict[str, Any] = {"runs": "runs", "seeds": [0, 1], "workers": 1, **SMALL, **TIMES}
     calm = offbench.train("td3_bc", medium, steps=300, **common | {"runs": "calm"})
     bad, good = offbench.train("td3_bc", medium, steps=100, **common)
