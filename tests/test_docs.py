@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import sys
 import tomllib
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import offbench
 from offbench.algorithm.interface import Algorithm, Batch, PolicyParts
 from offbench.rollouts.policy import ACTIVATIONS, KINDS
 from tests.doc_blocks import (
@@ -123,6 +125,14 @@ def test_source_files_named_in_the_pages_exist() -> None:
     }
     assert len(files) > 40
     assert not {(page, file) for page, file in files if not (ROOT / file).exists()}
+
+
+def test_every_public_name_is_in_the_python_reference() -> None:
+    named = re.findall(r"^::: (\S+)$", (DOCS / "api.md").read_text(), re.M)
+    for name in named:
+        module, _, attribute = name.rpartition(".")
+        assert hasattr(importlib.import_module(module), attribute), name
+    assert {f"offbench.{name}" for name in offbench.__all__} <= set(named)
 
 
 def test_every_page_is_in_the_sites_contents() -> None:
