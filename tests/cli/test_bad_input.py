@@ -198,7 +198,7 @@ def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     assert stopped.value.code == 2
     notices = ("converting ", "offbench: using the behaviour agent")
     said = [line for line in err.splitlines() if not line.startswith(notices)]
-    lines = [line for line in said if not re.fullmatch(r"\S+ on \S+: going on from step [\d,]+", line)]
+    lines = [line for line in said if not re.fullmatch(r"\S+ on \S+: resuming from step [\d,]+", line)]
     assert len(lines) == 1, err
     assert lines[0].startswith("offbench: ")
     assert "Traceback" not in out + err
