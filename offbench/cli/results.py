@@ -101,6 +101,9 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument(
         "--similarity", action="store_true", help="a run's similar score on its dataset instead of episodes"
     )
+    parser.add_argument(
+        "--algorithm", metavar="FILE.py:CLASS", help="similar score: the run's, if it is not installed"
+    )
     parser.add_argument("--tolerance", type=number, default=0.05, help="similar score: share of |Q| (default: 0.05)")
     parser.add_argument(
         "--action-tolerance", type=number, default=0.1, help="similar score by action: distance (default: 0.1)"
@@ -108,20 +111,30 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--workers", type=whole, help="processes (default: one per core)")
     trust(parser)
 
-    def similar(path: str, tolerance: float, action_tolerance: float, seed: int) -> None:
+    def similar(path: str, **options: Any) -> None:
         from offbench.evaluation.similarity import similarity
 
-        result = similarity(path, tolerance=tolerance, action_tolerance=action_tolerance, seed=seed)
+        result = similarity(path, **options)
         print(f"{path}: similar score at step {result.step:,} over {result.samples:,} transitions")
-        print(f"by Q       {result.q_similar:.2f}%  (within {100 * tolerance:g}% of |Q1(s, a)|)")
-        print(f"by action  {result.action_similar:.2f}%  (root mean square distance at most {action_tolerance:g})")
+        print(f"by Q       {result.q_similar:.2f}%  (within {100 * result.tolerance:g}% of |Q1(s, a)|)")
+        print(
+            f"by action  {result.action_similar:.2f}%  (root mean square distance at most {result.action_tolerance:g})"
+        )
 
-    def run(paths: list[str], similarity: bool, tolerance: float, action_tolerance: float, **arguments: Any) -> None:
+    def run(
+        paths: list[str],
+        similarity: bool,
+        algorithm: str | None,
+        tolerance: float,
+        action_tolerance: float,
+        **arguments: Any,
+    ) -> None:
         from offbench.evaluation.evaluate import evaluate
 
         for path in paths:
             if similarity:
-                similar(path, tolerance, action_tolerance, arguments["seed"])
+                reading = {"tolerance": tolerance, "action_tolerance": action_tolerance, "algorithm": algorithm}
+                similar(path, seed=arguments["seed"], **reading)
             else:
                 print("\n".join(([path] if len(paths) > 1 else []) + evaluate(path, **arguments).lines()))
 

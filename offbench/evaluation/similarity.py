@@ -47,26 +47,24 @@ def similarity(
     action_tolerance: float = 0.1,
     samples: int = 2560,
     seed: int = 0,
+    algorithm: str | type | None = None,
 ) -> Similarity:
     """Return a run's similar score in both readings, and write it to the run's similarity.json.
 
     Args:
         path: the run's folder.
         samples: transitions drawn from the run's dataset (ten batches of 256).
+        algorithm: the run's algorithm, if no installed package has it: `./my_algo.py:ReBRAC`, or the class.
 
     Raises:
-        OffbenchError: no run or checkpoint there, or the algorithm has no critic.
+        OffbenchError: no run or checkpoint there, the algorithm has no critic, or its code has changed.
     """
     import torch  # slow to import; reports only read similarity.json
 
-    from offbench.algorithm.networks import Network
     from offbench.training.train import restore
 
     run = Run(Path(path))
-    stack = restore(run)
-    critic = stack.algorithm.learned.get("critic")
-    if not isinstance(critic, Network):
-        raise OffbenchError(f"{path}: {run.config().algorithm} has no critic to compare by")
+    stack = restore(run, algorithm)
     rng = generator(seed, Purpose.SAMPLE)
     batch = stack.store.batch(torch.from_numpy(rng.integers(stack.store.sizes[0], size=(1, samples))))
     policy = stack.policy(0)
@@ -80,7 +78,9 @@ def similarity(
     )
     noise = policy.draw(rng, samples) if policy.needs_noise(deterministic=True) else None
     pi = torch.from_numpy(policy.act(batch.observations[0].numpy(), noise)).unsqueeze(0)
-    q_pi, q_data = (critic.frozen(batch.observations, a, members=0).flatten() for a in (pi, batch.actions))
+    q_pi, q_data = (stack.algorithm.q_values(batch.observations, a) for a in (pi, batch.actions))
+    if q_pi is None or q_data is None:
+        raise OffbenchError(f"{path}: {run.config().algorithm} has no critic to compare by")
     distance = (pi - batch.actions).square().mean(-1).sqrt().flatten()
     score = Similarity(
         stack.step,

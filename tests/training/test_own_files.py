@@ -71,7 +71,8 @@ def test_a_file_trains_resumes_and_reports(home: Path, capsys: pytest.CaptureFix
     assert whole.policy_path.read_bytes() == pieces.policy_path.read_bytes()
     assert whole.losses_path.read_bytes() == pieces.losses_path.read_bytes()
     assert pieces.folder == Path("runs") / DATA / "AWAC" / "batch_size=16,hidden=8x8" / "seed-0"
-    assert restore(pieces, "awac.py").step == 20
+    main(["evaluate", str(pieces.folder), "--similarity", "--algorithm", "awac.py"])
+    assert (pieces.folder / "similarity.json").exists()
     with pytest.raises(OffbenchError, match="is a run of AWAC, not of bdb"):
         restore(pieces, "bdb")
     capsys.readouterr()
