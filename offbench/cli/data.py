@@ -18,6 +18,12 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
     )
     completed(level, levels)
     parser.add_argument("--mix", metavar="LEVEL:SHARE,...", help="a mix of levels, e.g. random:0.5,expert:0.5")
+    parser.add_argument(
+        "--policy",
+        metavar="POLICY",
+        help="record this policy instead of a level: agent.zip (SB3), a run, a policy file, or module:function",
+    )
+    parser.add_argument("--name", help="with --policy: the level in the dataset's id (default: the policy's name)")
     parser.add_argument("--steps", type=whole, help="transitions (default: the recipe's, 1,000,000)")
     parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--workers", type=whole, help="recording processes (default: one per core)")

@@ -21,7 +21,11 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "collect": Command(
             "record a dataset of a level: random, medium, expert, ...",
             data.collect_arguments,
-            ["collect hopper --level medium", "collect hopper --mix random:0.5,expert:0.5 --steps 100000"],
+            [
+                "collect hopper --level medium",
+                "collect hopper --mix random:0.5,expert:0.5 --steps 100000",
+                "collect hopper --policy ppo.zip --name ppo --steps 100000",
+            ],
         ),
         "list": Command(
             "list environments, levels, algorithms, local datasets and runs",

@@ -22,6 +22,7 @@ from offbench.common.processes import default_workers
 from offbench.common.progress import Progress
 from offbench.common.provenance import versions
 from offbench.data import minari_store
+from offbench.data.behaviour_policy import BehaviourPolicy, level_name, read_behaviour_policy
 from offbench.data.card import compare
 from offbench.data.levels import Part, full_size, parse_level, parse_mix, shares
 from offbench.data.references import warn_other_references
@@ -29,10 +30,13 @@ from offbench.envs.contact_margin import MARGIN, without_margin
 from offbench.envs.environments import make_env
 from offbench.envs.physics import model_of
 from offbench.envs.recipes import Recipe, load_recipe
+from offbench.rollouts.function_policy import FunctionPolicy
 from offbench.rollouts.policy import Policy, uniform
 from offbench.rollouts.rollouts import Episode, Rollouts
 
 # What of the metadata makes two recordings the same one, with the versions that shape what an episode is.
+POLICY = "policy"  # the source of a part that a user's own policy plays
+AGENTLESS = ("uniform", POLICY)  # sources that need no behaviour agent
 WHAT_IT_IS = ("env", "level", "seed", "recipe_sha256", "parts", "references")
 PHYSICS = ("mujoco", "gymnasium", "numpy")
 HOME = "https://github.com/offbench/offbench"
@@ -50,6 +54,8 @@ def collect(
     overwrite: bool = False,
     retrain: bool = False,
     accept: bool = False,
+    policy: str | Path | None = None,
+    name: str | None = None,
     behaviour_dir: str | Path = BEHAVIOUR,
 ) -> str:
     """Record one level of one environment as a local Minari dataset.
@@ -66,6 +72,10 @@ def collect(
             another one is an error.
         retrain: use a behaviour agent trained here instead of the shipped one.
         accept: record the nearest policy where none is near a fraction, or medium is far from a third of the expert.
+        policy: record with this policy instead of a level: an agent's zip of Stable-Baselines3 (nothing of it is
+            unpickled), a run's folder, a policy file, or `module:function` of the user's own. It acts as it was
+            trained to explore: a stochastic one samples.
+        name: of the level that such a dataset gets; default: the policy's own name.
         behaviour_dir: where agents trained here live.
 
     Returns:
@@ -75,20 +85,29 @@ def collect(
         OffbenchError: anything that the user can fix, in one line.
     """
     recipe = load_recipe(env)
-    name, parts = parse_mix(mix) if mix is not None else parse_level(level)
+    given = None
+    if policy is None:
+        if name is not None:
+            raise OffbenchError("--name goes with --policy; give a dataset's id by --id")
+        name, parts = parse_mix(mix) if mix is not None else parse_level(level)
+    else:
+        if mix is not None or level != "medium":
+            raise OffbenchError("--policy records one policy: leave out --level and --mix")
+        name = level = level_name(name, str(policy))
+        given, parts = str(policy), (Part(POLICY),)
     dataset_id = minari_store.check_id(dataset_id or f"{recipe.name}-{name}-v{recipe.version}")
     if steps is not None and steps < 1:
         raise OffbenchError(f"steps must be at least 1, not {steps}")
     workers = default_workers(workers)
 
     def prepare(ladder: Ladder | None) -> tuple[_Recording, list[Rung | None], list[int], dict[str, Any]]:
-        recording = _Recording(recipe, ladder, seed, workers)
+        recording = _Recording(recipe, ladder, seed, workers, given)
         sources = [recording.source(part, accept) for part in parts]
         counts = _counts(recipe, ladder, parts, steps)
         return recording, sources, counts, _metadata(recording, dataset_id, mix or level, parts, sources, counts)
 
     ladder = find_ladder(recipe, Path(behaviour_dir), retrain)
-    trained = ladder is not None or all(part.source == "uniform" for part in parts)  # uniform actions need no agent
+    trained = ladder is not None or all(part.source in AGENTLESS for part in parts)
     prepared = prepare(ladder) if trained else None
     if prepared and not overwrite and minari_store.exists(dataset_id) and _is(dataset_id, prepared[-1]):
         minari_store.tidy(dataset_id)
@@ -155,7 +174,9 @@ def _full_size(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...]) -
 class _Recording:
     """What all parts of one dataset share. Without a ladder, parts are of uniform actions only."""
 
-    def __init__(self, recipe: Recipe, ladder: Ladder | None, seed: int, workers: int) -> None:
+    def __init__(
+        self, recipe: Recipe, ladder: Ladder | None, seed: int, workers: int, given: str | None = None
+    ) -> None:
         self.recipe, self._ladder, self.seed, self.workers = recipe, ladder, seed, workers
         self.spec = recipe.env_spec()
         env = make_env(self.spec)
@@ -163,6 +184,11 @@ class _Recording:
         self.action_space: Any = env.action_space
         self.mujoco = model_of(env) is not None
         env.close()
+        self.given: BehaviourPolicy | None = None
+        if given is not None:
+            space: Any = self.action_space
+            dim = int(np.prod(self.observation_space.shape or ()))
+            self.given = read_behaviour_policy(given, space.low, space.high, dim, recipe.env_id)
 
     @property
     def spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
@@ -193,7 +219,7 @@ class _Recording:
         Raises:
             OffbenchError: no rung is near what the part is defined as, and the user did not accept another.
         """
-        if part.source == "uniform":
+        if part.source in AGENTLESS:
             return None
         if part.source not in ("medium", "replay", "expert"):
             return self._nearest(float(part.source), accept)
@@ -232,8 +258,10 @@ class _Recording:
             file=sys.stderr,
         )
 
-    def policy(self, rung: Rung | None) -> Policy:
+    def policy(self, rung: Rung | None) -> Policy | FunctionPolicy:
         """Return the policy that plays a part."""
+        if self.given is not None:
+            return self.given.policy
         if rung is not None:
             return self.ladder.load(rung)
         low, high = self.action_space.low, self.action_space.high
@@ -260,6 +288,8 @@ class _Recording:
         """Return what a part is recorded from, for the dataset's description."""
         if part.source == "uniform":
             return "uniform-random actions"
+        if self.given is not None:
+            return f"the policy {self.given.source}"
         if rung is None:
             fraction = self.ladder.fraction(self.ladder.role("medium"))
             return f"the replay of SAC's training up to its medium policy, at {fraction:.2f} of the expert's return"
@@ -272,6 +302,9 @@ class _Recording:
         if part.source == "replay":
             medium = self.ladder.info["levels"]["medium"]
             return described | {"training_steps": medium, "sha256": self.ladder.info["medium_replay"]["sha256"]}
+        if self.given is not None:
+            made = {"policy": self.given.source, "algorithm": self.given.algorithm}
+            return described | made | {"policy_sha256": self.given.sha256}
         if rung is None:
             random = self.references["random"]
             return described | {"return": random["return"], "interval": [random["low"], random["high"]]}
@@ -322,7 +355,11 @@ def _metadata(
         "dataset_id": dataset_id,
         "minari_version": made["minari"],
         "eval_env_spec": without_margin(recording.spec)[0],
-        "algorithm_name": "random" if all(p.source == "uniform" for p in parts) else "SAC (Stable-Baselines3)",
+        "algorithm_name": recording.given.algorithm
+        if recording.given
+        else "random"
+        if all(p.source == "uniform" for p in parts)
+        else "SAC (Stable-Baselines3)",
         "author": {"offbench"},
         "author_email": {"offbench@example.org"},
         "code_permalink": f"{HOME}/tree/v{made['offbench']}",

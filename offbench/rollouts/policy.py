@@ -3,6 +3,7 @@
     W0 [obs, h]  b0 [h]  W1 [h, h]  b1 [h]  W2 [h, out]  b2 [out]        (x @ W + b, activation between)
     kind "tanh"               out = act          action = tanh(out)
     kind "squashed_gaussian"  out = 2 x act      action = tanh(mean + std * noise), log std clipped to [-20, 2]
+    kind "gaussian"           out = 2 x act      action = clip(mean + std * noise), not scaled: SB3's PPO and A2C
     kind "best_by_q"          the squashed Gaussian's best of `samples` actions by Q(observation, action in [-1, 1])
     kind "uniform"            no weights         action = uniform in the bounds
 
@@ -34,7 +35,7 @@ from offbench.common.files import damage, read_bytes, write_bytes
 if TYPE_CHECKING:
     from offbench.algorithm.interface import PolicyParts  # brings PyTorch, which processes that play do without
 
-KINDS = ("tanh", "squashed_gaussian", "best_by_q", "uniform")
+KINDS = ("tanh", "squashed_gaussian", "gaussian", "best_by_q", "uniform")
 Layers = tuple[tuple[Array, Array], ...]
 ACTIVATIONS: dict[str, Callable[[Array], Any]] = {  # in place
     "relu": lambda x: np.maximum(x, 0.0, out=x),
@@ -123,7 +124,7 @@ class Policy:
     @property
     def stochastic(self) -> bool:
         """True if its actions can be sampled."""
-        return self.kind in ("squashed_gaussian", "uniform")
+        return self.kind in ("squashed_gaussian", "gaussian", "uniform")
 
     def needs_noise(self, deterministic: bool) -> bool:
         """Return whether `act` must be given noise: to sample, or to have actions to choose from."""
@@ -146,6 +147,9 @@ class Policy:
             noise: from `draw`, or None to act deterministically (the mode; uniform has none: zeros).
         """
         double = self._double
+        if self.kind == "gaussian":
+            mean, std = self._gaussian(observations)
+            return _clip(mean if noise is None else mean + std * noise, double.low, double.high).astype(np.float32)
         squashed = self._squashed(observations, noise)
         # +1 before scaling keeps both ends exact: tanh = -1 gives low, tanh = 1 gives high
         actions = double.low + (squashed + 1.0) * ((double.high - double.low) / 2)
@@ -168,6 +172,15 @@ class Policy:
         best = _forward(double.critic, np.concatenate([repeated, actions], -1), self.activation)[..., 0].argmax(1)
         chosen: Array = actions[np.arange(len(actions)), best]
         return chosen
+
+    def _gaussian(self, observations: Array) -> tuple[Array, Array]:
+        """Return mean and std [n, act] of the actions before the bounds."""
+        double = self._double
+        out = _forward(
+            double.actor, (np.asarray(observations, np.float64) - double.mean) / double.std, self.activation
+        )
+        mean, log_std = out[:, : len(self.low)], out[:, len(self.low) :]
+        return mean, np.asarray(np.exp(_clip(log_std, LOG_STD_MIN, LOG_STD_MAX)))
 
     def to_bytes(self) -> bytes:
         """Return the policy file's content."""

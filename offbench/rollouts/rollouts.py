@@ -32,6 +32,7 @@ from offbench.common.processes import closing, quiet_start, start_errors, start_
 from offbench.common.scores import interval
 from offbench.common.seeds import Purpose
 from offbench.envs.environments import LONGEST, make_env, reason, time_limit
+from offbench.rollouts.function_policy import MARK, FunctionPolicy, from_mark
 from offbench.rollouts.policy import Policy, from_bytes
 
 LANES = 16  # episodes that share a policy forward
@@ -111,7 +112,7 @@ def summary(outcomes: list[Outcome], prefix: str = "") -> dict[str, float]:
 class _Lane:
     """One environment in the middle of an episode."""
 
-    def __init__(self, env: gym.Env[Any, Any], policy: Policy, task: Task, slot: int) -> None:
+    def __init__(self, env: gym.Env[Any, Any], policy: Policy | FunctionPolicy, task: Task, slot: int) -> None:
         index = task.indices[slot]
         self.env, self.policy, self.slot = env, policy, slot
         self.seed = seeds.integer(task.seed, Purpose.RESET, *task.stream, index)
@@ -205,8 +206,8 @@ def play(task: Task) -> list[Episode] | list[Outcome]:
 
 
 @functools.lru_cache(maxsize=4)
-def _policy(data: bytes) -> Policy:
-    return from_bytes(data)
+def _policy(data: bytes) -> Policy | FunctionPolicy:
+    return from_mark(data) if data.startswith(MARK) else from_bytes(data)
 
 
 @functools.lru_cache(maxsize=4)
@@ -265,7 +266,7 @@ class Rollouts:
         return future
 
     def episodes(
-        self, policy: Policy, seed: int, stream: tuple[int, ...] = (), enough: int | None = None
+        self, policy: Policy | FunctionPolicy, seed: int, stream: tuple[int, ...] = (), enough: int | None = None
     ) -> Iterator[Episode]:
         """Yield episodes 0, 1, 2, ... of the sampling policy without end, in order. Close the iterator when done.
 
@@ -297,14 +298,14 @@ class Rollouts:
                 future.cancel()
 
     def outcomes(
-        self, policy: Policy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
+        self, policy: Policy | FunctionPolicy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
     ) -> Future[list[Outcome]]:
         """Start `count` evaluation episodes; the future gives their returns and lengths in order."""
         tasks = self.outcome_tasks(policy, seed, stream, count, deterministic)
         return _gather([self.submit(task) for task in tasks])
 
     def outcome_tasks(
-        self, policy: Policy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
+        self, policy: Policy | FunctionPolicy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
     ) -> list[Task]:
         """Cut an evaluation into tasks, one for each worker if there are enough episodes."""
         data, parts = policy.to_bytes(), max(1, min(self.workers, count // 2))

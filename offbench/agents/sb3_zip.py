@@ -1,0 +1,122 @@
+"""The policy in a zip that Stable-Baselines3 saved: SAC, TD3, DDPG, PPO and A2C with MLP policies.
+
+Such a zip holds pickled data, which can run anything when it is loaded. Only two members are read here: policy.pth, by
+`torch.load(weights_only=True)`, which makes tensors alone, and `data`, as JSON text, for the name of the activation.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import re
+import warnings
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offbench.common.arrays import Array
+from offbench.common.errors import OffbenchError
+from offbench.rollouts.policy import ACTIVATIONS, Layers, Policy
+
+LARGEST = 2**30  # bytes of a member, unpacked
+
+
+def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
+    """Return the policy of an SB3 agent; nothing of the zip is unpickled.
+
+    Args:
+        low, high: [act], the bounds of the environment's actions.
+
+    Raises:
+        OffbenchError: not such a zip, a damaged or hostile one, or a policy that is not an MLP's.
+    """
+    try:
+        tensors, settings = _read(path)
+    except FileNotFoundError:
+        raise OffbenchError(f"no file {path}") from None
+    except (ValueError, KeyError, TypeError, EOFError, OSError, RuntimeError, zipfile.BadZipFile) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise OffbenchError(f"{path} is not a readable zip of Stable-Baselines3: {reason}") from None
+    except (pickle.UnpicklingError, RecursionError):
+        raise OffbenchError(f"{path} is refused: its policy.pth holds more than tensors") from None
+    if settings.get("use_sde") is True:
+        raise OffbenchError(f"{path} uses gSDE exploration, which offbench does not play")
+    kind, layers, algorithm, default = _layers(path, tensors)
+    activation = _activation(path, settings, default)
+    if any(not np.isfinite(array).all() for pair in layers for array in pair):
+        raise OffbenchError(f"{path} holds NaN or infinite weights")
+    zeros = np.zeros(layers[0][0].shape[0], np.float32)
+    origin = {"algorithm": f"{algorithm} (Stable-Baselines3)"}
+    return Policy(kind, layers, zeros, zeros + 1, low, high, env_id, origin, activation=activation)
+
+
+def _read(path: Path) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Return the tensors of policy.pth and the plain settings of data. Raises what zipfile and torch raise."""
+    import torch
+
+    with zipfile.ZipFile(path) as archive:
+        for name in ("policy.pth", "data"):
+            if archive.getinfo(name).file_size > LARGEST:
+                raise ValueError(f"{name} is larger than {LARGEST:,} bytes")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of old formats: what they hold is checked below
+            weights = torch.load(io.BytesIO(archive.read("policy.pth")), map_location="cpu", weights_only=True)
+        settings = json.loads(archive.read("data"))
+    if not isinstance(weights, Mapping) or not isinstance(settings, dict):
+        raise ValueError("its policy.pth or data are not what SB3 writes")
+    tensors = {}
+    for name, value in weights.items():
+        if isinstance(value, torch.Tensor) and value.layout == torch.strided and not value.is_quantized:
+            tensors[str(name)] = value.detach().to(torch.float32).numpy()
+    return tensors, settings
+
+
+def _layers(path: Path, tensors: Mapping[str, Array]) -> tuple[str, Layers, str, str]:
+    """Return kind, layers, name of the algorithm and its default activation."""
+    try:
+        if "actor.latent_pi.0.weight" in tensors or "actor.mu.weight" in tensors:
+            head = _joined([_layer(tensors, "actor.mu"), _layer(tensors, "actor.log_std")])
+            return "squashed_gaussian", (*_sequence(tensors, "actor.latent_pi"), head), "SAC", "relu"
+        if "actor.mu.0.weight" in tensors:
+            return "tanh", _sequence(tensors, "actor.mu"), "TD3 or DDPG", "relu"
+        if "action_net.weight" in tensors:
+            weight, bias = _layer(tensors, "action_net")
+            std = tensors["log_std"]
+            if std.shape != bias.shape:
+                raise KeyError("log_std")
+            head = _joined([(weight, bias), (np.zeros_like(weight), std)])
+            return "gaussian", (*_sequence(tensors, "mlp_extractor.policy_net"), head), "PPO or A2C", "tanh"
+    except (KeyError, ValueError, IndexError) as error:
+        raise OffbenchError(f"{path} is not an MLP policy as SB3 saves it: {error}") from None
+    raise OffbenchError(f"{path} holds no policy of SAC, TD3, DDPG, PPO or A2C with an MLP")
+
+
+def _layer(tensors: Mapping[str, Array], name: str) -> tuple[Array, Array]:
+    weight, bias = tensors[f"{name}.weight"], tensors[f"{name}.bias"]
+    if weight.ndim != 2 or bias.shape != weight.shape[:1]:
+        raise ValueError(f"{name} has shapes {weight.shape} and {bias.shape}")
+    return np.ascontiguousarray(weight.T), bias
+
+
+def _joined(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    return np.concatenate([weight for weight, _ in parts], 1), np.concatenate([bias for _, bias in parts])
+
+
+def _sequence(tensors: Mapping[str, Array], name: str) -> Layers:
+    """Return the linear layers of a torch.nn.Sequential, in order."""
+    found = (re.fullmatch(rf"{re.escape(name)}\.(\d+)\.weight", key) for key in tensors)
+    return tuple(_layer(tensors, f"{name}.{place}") for place in sorted(int(match[1]) for match in found if match))
+
+
+def _activation(path: Path, settings: Mapping[str, Any], default: str) -> str:
+    """Return the activation by the text of policy_kwargs, where SB3 repeats what it pickles."""
+    kwargs = settings.get("policy_kwargs")
+    text = str(kwargs.get("activation_fn", "")) if isinstance(kwargs, dict) else ""
+    name = re.sub(r"^<class '(?:\w+\.)*(\w+)'>$", r"\1", text).lower() or default
+    if name not in ACTIVATIONS:
+        raise OffbenchError(f"{path} has the activation {text:.60}; offbench plays {', '.join(ACTIVATIONS)}")
+    return name

@@ -1,0 +1,100 @@
+"""A behaviour policy that is a user's own function: `module:function`, from an observation to an action."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from offbench.common.arrays import Array
+from offbench.common.errors import SHOW_TRACEBACK, OffbenchError
+
+MARK = b"offbench-function "  # never in a policy file: only this process names functions to its workers
+TOLERANCE = 1e-5  # beyond the bounds, of float32 actions
+
+
+@dataclass(frozen=True)
+class FunctionPolicy:
+    """Acts by calling a function once per observation.
+
+    Attributes:
+        name: `module:function`, importable from the current folder.
+        low, high: [act], the bounds of the environment's action space.
+    """
+
+    name: str
+    low: Array
+    high: Array
+    function: Callable[[Array], Any]
+
+    def needs_noise(self, deterministic: bool) -> bool:
+        """Return False: the function draws what it needs itself."""
+        return False
+
+    def draw(self, rng: np.random.Generator, count: int) -> Array:
+        """Return nothing for each action."""
+        return np.zeros((count, 0))
+
+    def act(self, observations: Array, noise: Array | None) -> npt.NDArray[np.float32]:
+        """Return the actions [n, act] for observations [n, obs]. Raises OffbenchError for anything but an action."""
+        actions = []
+        for observation in observations:
+            try:
+                action = np.asarray(self.function(observation), np.float64).reshape(-1)
+            except Exception as error:
+                what = f"{type(error).__name__}: {error}"
+                raise OffbenchError(f"the policy {self.name} failed: {what} ({SHOW_TRACEBACK})") from error
+            if action.shape != self.low.shape or not np.isfinite(action).all():
+                raise OffbenchError(f"the policy {self.name} returned {action}, not {len(self.low)} finite numbers")
+            if (action < self.low - TOLERANCE).any() or (action > self.high + TOLERANCE).any():
+                raise OffbenchError(
+                    f"the policy {self.name} returned {action}, which is outside the bounds {self.low} to {self.high}"
+                )
+            actions.append(np.clip(action, self.low, self.high))
+        return np.array(actions, np.float32).reshape(len(observations), len(self.low))
+
+    def to_bytes(self) -> bytes:
+        """Return what a worker process makes this policy from."""
+        bounds = np.stack([self.low, self.high]).astype(np.float32).tobytes()
+        return MARK + self.name.encode() + b"\0" + bounds
+
+    def source(self) -> bytes:
+        """Return the source of the module, for its hash."""
+        path = inspect.getsourcefile(self.function)
+        if path is None or not os.path.exists(path):
+            return self.name.encode()
+        with open(path, "rb") as file:
+            return file.read()
+
+
+def function_policy(name: str, low: Array, high: Array) -> FunctionPolicy:
+    """Import `module:function`, the current folder's modules included.
+
+    Raises:
+        OffbenchError: no such module or function, or the module fails.
+    """
+    module, _, attribute = name.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        function = getattr(importlib.import_module(module), attribute, None)
+    except Exception as error:
+        what = f"{type(error).__name__}: {error}"
+        raise OffbenchError(f"cannot import the policy {name}: {what} ({SHOW_TRACEBACK})") from error
+    if not callable(function):
+        raise OffbenchError(f"the module {module} has no function {attribute!r}")
+    return FunctionPolicy(name, low, high, function)
+
+
+def from_mark(data: bytes) -> FunctionPolicy:
+    """Make the policy that `to_bytes` wrote, in a worker process."""
+    name, bounds = data.removeprefix(MARK).split(b"\0", 1)
+    low, high = np.frombuffer(bounds, np.float32).reshape(2, -1)
+    return function_policy(name.decode(), low, high)

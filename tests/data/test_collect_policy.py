@@ -1,0 +1,119 @@
+"""`collect --policy`: agents trained with SB3 and saved as zips, policy files, functions; a hostile zip is refused."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+
+import offbench
+from offbench.agents.sb3_zip import read_sb3_zip
+from offbench.common.errors import OffbenchError
+from offbench.data import minari_store
+
+ENV = "InvertedPendulum-v5"
+LOW, HIGH = np.array([-3], np.float32), np.array([3], np.float32)
+AGENTS: dict[str, tuple[Any, dict[str, Any], dict[str, Any]]] = {
+    "sac": (SAC, {"net_arch": [8, 6]}, {"buffer_size": 10}),
+    "td3": (TD3, {"net_arch": [8]}, {"buffer_size": 10}),
+    "ddpg": (DDPG, {"net_arch": [8], "activation_fn": torch.nn.Tanh}, {"buffer_size": 10}),
+    "ppo": (PPO, {"net_arch": [8, 6]}, {}),
+    "a2c": (A2C, {"net_arch": {"pi": [5], "vf": [7]}, "activation_fn": torch.nn.ReLU}, {}),
+}
+
+
+def saved(name: str, folder: Path) -> tuple[Any, Path]:
+    """Return an SB3 agent and its zip."""
+    cls, kwargs, more = AGENTS[name]
+    model = cls("MlpPolicy", gym.make(ENV), policy_kwargs=kwargs, seed=1, device="cpu", **more)
+    model.save(folder / f"{name}.zip")
+    return model, folder / f"{name}.zip"
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_a_zips_policy_acts_as_in_sb3(name: str, home: Path, rng: np.random.Generator) -> None:
+    model, path = saved(name, home)
+    observations = rng.normal(size=(50, 4)).astype(np.float32) * 3
+    expected, _ = model.predict(observations, deterministic=True)
+    policy = read_sb3_zip(path, LOW, HIGH, ENV)
+    np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
+    if name in ("ppo", "a2c"):  # the std, by the log-density of the mode
+        spread = (policy(observations, rng) - policy(observations)).std()
+        assert 0.5 < spread < 1.5  # log_std is 0 before training
+    policy.save(home / "policy.safetensors")
+    np.testing.assert_array_equal(
+        offbench.load_policy(home / "policy.safetensors")(observations), policy(observations)
+    )
+
+
+class Touch:
+    """What runs code when it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.system, ("touch PWNED",)
+
+
+def test_a_hostile_zip_is_refused(home: Path, tiny: tuple[str, str]) -> None:
+    _, path = saved("td3", home)
+    evil = io.BytesIO()
+    torch.save({"actor.mu.0.weight": Touch()}, evil)
+    with zipfile.ZipFile(path) as archive:
+        data = archive.read("data")
+    for content in (evil.getvalue(), pickle.dumps(Touch()), b"", b"PK"):
+        with zipfile.ZipFile(home / "evil.zip", "w") as archive:
+            archive.writestr("policy.pth", content)
+            archive.writestr("data", data)
+        with pytest.raises(OffbenchError, match=r"evil\.zip is (refused|not a readable zip)"):
+            offbench.collect(tiny[0], policy="evil.zip", behaviour_dir=tiny[1])
+    assert not (home / "PWNED").exists()
+    assert minari_store.local_ids() == []
+
+
+def test_what_is_recorded_is_what_the_policy_does(home: Path, tiny: tuple[str, str]) -> None:
+    recipe, behaviour_dir = tiny
+    _, path = saved("td3", home)
+    dataset = offbench.collect(recipe, policy=path, steps=200, behaviour_dir=behaviour_dir, workers=1)
+    assert dataset == "tiny-td3-v0"
+    data = offbench.load(dataset)
+    policy = read_sb3_zip(path, LOW, HIGH, ENV)
+    observations = np.array(data.observations[data.rows])
+    np.testing.assert_allclose(np.array(data.actions) * 3, policy(observations), atol=1e-4)
+    metadata = minari_store.read_metadata(dataset)
+    assert metadata["algorithm_name"] == "TD3 or DDPG (Stable-Baselines3)"
+    assert metadata["offbench"]["parts"][0]["policy"] == "td3.zip"
+    policy.save(home / "mine.safetensors")
+    other = offbench.collect(recipe, policy="mine.safetensors", steps=200, behaviour_dir=behaviour_dir, workers=1)
+    assert other == "tiny-mine-v0"
+    assert offbench.load(other).content == data.content
+
+
+def test_a_function_of_ones_own(home: Path, tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe, behaviour_dir = tiny
+    (home / "my_policy_module.py").write_text(
+        "def act(o):\n    return [0.5 * o[1]]\n\ndef wild(o):\n    return [99.0]\n"
+    )
+    monkeypatch.syspath_prepend(str(home))
+    more: dict[str, Any] = {"steps": 60, "behaviour_dir": behaviour_dir, "workers": 1}
+    dataset = offbench.collect(recipe, policy="my_policy_module:act", name="lean", **more)
+    assert dataset == "tiny-lean-v0"
+    data = offbench.load(dataset)
+    observations = np.array(data.observations[data.rows])
+    np.testing.assert_allclose(np.array(data.actions)[:, 0] * 3, 0.5 * observations[:, 1], atol=1e-4)
+    for name, message in {
+        "my_policy_module:wild": "outside the bounds",
+        "my_policy_module:none": "has no function 'none'",
+        "no_such_module_here:act": "cannot import the policy",
+    }.items():
+        with pytest.raises(OffbenchError, match=message):
+            offbench.collect(recipe, policy=name, name="bad", **more)
+    with pytest.raises(OffbenchError, match="'medium' is a level of offbench's own agents"):
+        offbench.collect(recipe, policy="my_policy_module:act", name="medium", **more)
