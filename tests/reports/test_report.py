@@ -146,7 +146,7 @@ def test_the_published_numbers_are_found_by_method() -> None:
     assert Method("bdb", "beta=0.5", "0.50").published == "bdb beta=0.50"
     known = {row["method"] for row in published("scores")}
     assert Method("bdb", "beta_max=0.5", "adaptive").published == ""  # no paper has it
-    options = fields(load_algorithm("bdb").Config)
+    options = fields(load_algorithm("bdb_plus").Config)
     assert {name for name, field in options.items() if field.metadata["help"].startswith("ours")} == OURS
     assert {"td3_bc", "cql", "bdb beta=0.50", "bdb beta=adaptive"} <= known
     assert Method("bdb", "hidden=8x8", "adaptive").label == "bdb (adaptive, hidden=8x8)"
