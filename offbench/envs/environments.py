@@ -30,7 +30,7 @@ WHAT_MATTERS = ("id", "kwargs", "max_episode_steps")  # with the contact margins
 LARGEST_BOUND = 1e6  # of actions; what has larger ones, such as float32's largest number, has none
 LONGEST = 20_000  # steps that an episode may take in an environment without a time limit
 LARGEST_LIMIT = 1_000_000  # a time limit beyond this is none
-ELSEWHERE = "give `offbench train` or `offbench evaluate` an --env RECIPE"
+ELSEWHERE = "give the right environment with --env RECIPE"
 
 
 def env_spec(env_id: str, **kwargs: Any) -> str:

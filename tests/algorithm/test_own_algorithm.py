@@ -47,8 +47,8 @@ OWN: dict[str, tuple[type, str]] = {
     "not reduced": (own(update=lambda self: {"q": torch.zeros(2, 8)}), "[runs] = [2], got one [2, 8]"),
     "no logs": (own(update=lambda self: None), "AWAC.update must return a dict of logs, not a NoneType"),
     "a kind": (
-        own(policy=lambda self: PolicyParts("gaussian", self.actor.layers(0))),
-        "AWAC.policy: unknown kind 'gaussian'; known: tanh, squashed_gaussian, best_by_q, uniform",
+        own(policy=lambda self: PolicyParts("mixture", self.actor.layers(0))),
+        "AWAC.policy: unknown kind 'mixture'",
     ),
     "an activation": (
         own(policy=lambda self: PolicyParts("tanh", self.actor.layers(0), activation="gelu")),

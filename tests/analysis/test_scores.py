@@ -19,7 +19,7 @@ from offbench.cli.main import main
 from offbench.common.scores import interval, mean_std, normalize, run_return
 from offbench.envs.recipes import d4rl_reference
 from offbench.reports.curves import plot_curves
-from offbench.training.run import Run
+from offbench.training.run import Run, RunConfig
 
 
 def test_normalize_by_hand() -> None:
@@ -82,7 +82,7 @@ def write_run(
     references = {"dataset": [0.0, 200.0], "d4rl": d4rl}
     config |= {"settings": {}, "dataset_sha256": content, "eval_every": 100, "eval_episodes": len(returns)}
     run.folder.mkdir(parents=True)
-    run.claim(config | {"references": references, "steps": 100})
+    run.claim(RunConfig(**config, references=references, steps=100))
     if returns:
         run.write_evaluations({100: [(value, 3) for value in returns]})
 

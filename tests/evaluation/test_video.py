@@ -102,7 +102,7 @@ def test_the_users_choice_of_backend_is_put_back(monkeypatch: pytest.MonkeyPatch
         (["ant:medium", "--out", "a.gif"], "no ladder"),
         (["nothing", "--out", "a.gif"], "no policy file"),
         ([str(POLICY), "--out", "new/a.gif"], "cannot write new/a.gif: there is no folder new"),
-        ([str(POLICY), "--env", "hopper", "--out", "a.gif"], "give the right one"),
+        ([str(POLICY), "--env", "hopper", "--out", "a.gif"], "--env RECIPE"),
         ([str(POLICY), "--seconds", "0", "--out", "a.gif"], "more than 0"),
         ([str(POLICY), "--fps", "0", "--out", "a.gif"], "whole number from 1"),
     ],
