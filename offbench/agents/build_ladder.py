@@ -66,20 +66,24 @@ class RungEvaluator:
         self.screened_within: dict[int, float] = {}  # mean returns
         self.measured: dict[int, dict[str, float]] = {}
 
+        self._earlier: dict[str, dict[str, Any]] = {"screened": {}, "measured": {}}  # by the step as text
+
     def resume(self) -> None:
-        """Take over what an earlier call measured in this folder with the same packages and number of episodes."""
+        """Let what an earlier call measured in this folder, with the same packages and number of episodes, be reused.
+
+        The choice is the same as without it: a policy counts as measured once this call asks for it.
+        """
         path = self.folder.path / MEASURED
         if not path.exists():
             return
         with damage(str(path), "is damaged", "delete it"):
             table = read_json(path)
             if table["made"] == self._made():
-                self.screened_within = {int(step): float(value) for step, value in table["screened"].items()}
-                self.measured = {int(step): dict(row) for step, row in table["measured"].items()}
+                self._earlier = {name: dict(table[name]) for name in self._earlier}
 
-    def _save(self) -> None:
-        table = {"made": self._made(), "screened": self.screened_within, "measured": self.measured}
-        write_json(self.folder.path / MEASURED, table)
+    def _save(self, kind: str, step: int, value: Any) -> None:
+        self._earlier[kind][str(step)] = value
+        write_json(self.folder.path / MEASURED, {"made": self._made(), **self._earlier})
 
     def _made(self) -> dict[str, Any]:
         episodes = self.folder.recipe.measure.rung_episodes
@@ -88,16 +92,19 @@ class RungEvaluator:
     def measure(self, step: int) -> float:
         """Return the mean return of a policy over the recipe's `rung_episodes`."""
         if step not in self.measured:
-            policy = load_policy(self.folder.policy(step))
-            count = self.folder.recipe.measure.rung_episodes
-            row: dict[str, float] = {"episodes": count}
-            for prefix, deterministic in (("", False), ("deterministic_", True)):
-                stream = (int(Purpose.MEASURE), step, int(deterministic))
-                row |= summary(self.run(policy, stream, count, deterministic), prefix)
+            row = self._earlier["measured"].get(str(step)) or self._play(step)
             self.measured[step] = row
-            self._save()
-            _say(f"policy of step {step:,}: return {row['return']:.1f} over {count} episodes")
+            self._save("measured", step, row)
+            _say(f"policy of step {step:,}: return {row['return']:.1f} over {row['episodes']} episodes")
         return self.measured[step]["return"]
+
+    def _play(self, step: int) -> dict[str, float]:
+        policy, count = load_policy(self.folder.policy(step)), self.folder.recipe.measure.rung_episodes
+        row: dict[str, float] = {"episodes": count}
+        for prefix, deterministic in (("", False), ("deterministic_", True)):
+            stream = (int(Purpose.MEASURE), step, int(deterministic))
+            row |= summary(self.run(policy, stream, count, deterministic), prefix)
+        return row
 
     def screen(self, step: int) -> float:
         """Return the mean return of a policy within a segment over the recipe's few screening episodes."""
@@ -188,8 +195,9 @@ class RungEvaluator:
         if new:
             _say(f"screening {len(new)} policies between steps {first:,} and {last:,}")
         for step in new:
-            self.screened_within[step] = self.screen(step)
-            self._save()
+            earlier = self._earlier["screened"].get(str(step))
+            self.screened_within[step] = self.screen(step) if earlier is None else float(earlier)
+            self._save("screened", step, self.screened_within[step])
         return steps
 
 
@@ -238,7 +246,11 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
         medium = evaluator.medium(worst + MEDIUM * (best - worst), worst + MEDIUM_AT_MOST * (best - worst), expert)
         parts = max(folder.recipe.measure.rungs - 2, 1)  # beside medium and expert
         part = (best - worst) / parts
-        others = {evaluator.nearest(worst + i * part, part / 4) for i in range(1, parts)}
+        targets = [worst + i * part for i in range(1, parts)]
+        for target in targets:
+            evaluator.nearest(target, part / 4)
+        # a policy that was measured for one target may be the nearest to another
+        others = {min(evaluator.measured, key=lambda step: abs(evaluator.measure(step) - t)) for t in targets}
     roles: dict[int, str] = dict.fromkeys(sorted(others | {medium, expert}), "")
     for step, role in ((medium, "medium"), (expert, "expert")):
         roles[step] = f"{roles[step]}+{role}".lstrip("+")
