@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import offbench
+from offbench.agents.ladder import read_ladder
 from offbench.common.errors import OffbenchError
 from offbench.common.files import read_json
 from offbench.common.provenance import versions
@@ -37,6 +38,15 @@ def test_levels_are_in_order(name: str) -> None:
     means = [levels[level]["return"] for level in LEVELS]
     assert means == sorted(means)
     assert len(set(means)) == len(means)
+
+
+def test_a_ladder_with_policies_within_segments_is_dense() -> None:
+    """The others were trained before policies were kept within segments."""
+    ladder = read_ladder(shipped("inverted-pendulum") / "behaviour")
+    assert ladder is not None
+    assert 1 / 3 <= ladder.fraction(ladder.role("medium")) <= 0.45
+    for tenth in range(1, 11):
+        assert abs(ladder.fraction(ladder.nearest(tenth / 10)) - tenth / 10) <= 0.05
 
 
 @pytest.mark.parametrize("name", CARDS)
