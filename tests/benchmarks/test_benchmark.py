@@ -123,7 +123,7 @@ def test_a_finished_grid_is_left_alone(grid: str, home: Path, capsys: pytest.Cap
     said = capsys.readouterr().out
     assert "4 runs, 0 to train" in said
     assert "bdb" in said.splitlines()[-2]  # the paper's order: td3_bc, cql, bdb
-    assert "different steps" in said.splitlines()[-1]  # 200 updates and 100
+    assert "different steps" in said  # 200 updates and 100
 
 
 def test_the_table_is_of_the_grids_runs(grid: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -244,10 +244,10 @@ def test_odd_terminals_get_what_they_can_show() -> None:
 def test_whatever_a_command_raises_is_one_line(
     error: Exception, names: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail() -> None:
+    def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr("offbench.tools.inventory.inventory_lines", fail)
+    monkeypatch.setattr("offbench.tools.inventory.inventory", fail)
     assert names in refusal(["list"], capsys)
     monkeypatch.setenv("OFFBENCH_TRACEBACK", "1")
     with pytest.raises(SystemExit):
@@ -285,7 +285,7 @@ def test_an_error_in_an_installed_algorithm_keeps_its_traceback(
     said = capfd.readouterr().err
     assert stopped.value.code == 2
     assert 'mine.py", line 6, in update' in said
-    assert "the package mine: ZeroDivisionError: of mine" in said.splitlines()[-1]
+    assert "an error in mine: ZeroDivisionError: of mine" in said.splitlines()[-1]
 
 
 def test_damage_brings_no_error_of_a_parser_out() -> None:

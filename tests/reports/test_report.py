@@ -16,7 +16,7 @@ from offbench.analysis.results import Task, read_results
 from offbench.cli.main import main
 from offbench.common.files import write_json
 from offbench.common.settings import fields
-from offbench.evaluation import evaluate
+from offbench.evaluation.similarity import similarity
 from offbench.reports.tables import published
 from offbench.training.registry import load_algorithm
 from tests.made_runs import METHODS, made_grid, made_run
@@ -244,7 +244,7 @@ def test_a_real_training(medium: str, home: Path) -> None:
     folders = offbench.train("bdb", medium, seeds=range(2), beta=[0.25, "adaptive"], **sizes)
     folders += offbench.train("td3_bc", medium, **sizes)
     for folder in folders:
-        evaluate.similarity(folder, samples=256)
+        similarity(folder, samples=256)
     page = Page(offbench.report(home / "runs", home / "out"))
     assert {"scores", "improvement", "similarity", "beta", "critic"} <= set(page.ids)
     ((row),) = rows(home / "out" / "tables" / "scores.csv")
