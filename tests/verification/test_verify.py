@@ -123,14 +123,14 @@ def test_observations_shifted_by_one(hopper: str, shift: Callable[[h5py.Group], 
 
 def test_swapped_medium_and_expert() -> None:
     """Under each other's id, everything else made to fit; and as the halves of medium-expert."""
-    names = [offbench.collect("inverted-pendulum", level, steps=6000, workers=1) for level in ("medium", "expert")]
+    names = [offbench.collect("inverted-pendulum", level, steps=20_000, workers=1) for level in ("medium", "expert")]
     files = [minari_store.path_of(name) / "data" / "main_data.hdf5" for name in names]
     contents = [path.read_bytes() for path in files]
     for path, content in zip(files, reversed(contents), strict=True):
         path.write_bytes(content)
     for name in names:
         assert codes(tamper(name, lambda _: None)) >= {"wrong-level"}
-    both = offbench.collect("inverted-pendulum", "medium-expert", steps=12000, workers=1)
+    both = offbench.collect("inverted-pendulum", "medium-expert", steps=40_000, workers=1)
     parts = minari_store.provenance(minari_store.read_metadata(both))["parts"]
     change_metadata(both, parts=parts[::-1])
     assert codes(both) >= {"wrong-level", "metadata"}
@@ -138,8 +138,8 @@ def test_swapped_medium_and_expert() -> None:
 
 def test_swapped_halves_of_medium_expert() -> None:
     """The episodes themselves change places, seeds and all; parts of equal size still end where episodes end."""
-    name = offbench.collect("inverted-pendulum", "medium-expert", steps=12000, workers=1)
-    first = int(np.searchsorted(np.cumsum([len(e) for e in episodes_of(open_minari(name))]), 6000)) + 1
+    name = offbench.collect("inverted-pendulum", "medium-expert", steps=40_000, workers=1)
+    first = int(np.searchsorted(np.cumsum([len(e) for e in episodes_of(open_minari(name))]), 20_000)) + 1
 
     def swap(file: h5py.File) -> None:
         count = len(file)
