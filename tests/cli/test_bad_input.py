@@ -155,7 +155,7 @@ CASES: dict[str, tuple[str, str]] = {
     "show mujoco/hopper/medium-v0": ("no local dataset", "`minari download mujoco/hopper/medium-v0`"),
     "train bc --dataset mujoco/hopper/medium-v0": ("no local dataset", "`minari download mujoco/hopper/medium-v0`"),
     "verify mujoco/hopper/medium-v0": ("no local dataset", "`minari download mujoco/hopper/medium-v0`"),
-    "train iql --dataset MEDIUM": ("unknown algorithm 'iql': available: bc", "td3_bc"),
+    "train ddpg --dataset MEDIUM": ("unknown algorithm 'ddpg': available: bc", "td3_bc"),
     "plot": ("unknown command 'plot': available: ", "report"),
     "eval": ("did you mean 'evaluate'?", ""),
     "export MEDIUM --out new/out.hdf5": ("cannot write new/out.hdf5: there is no folder new", ""),
