@@ -27,6 +27,7 @@ from offbench.common.files import disk_errors, output_file
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.progress import Progress
 from offbench.data import minari_store
+from offbench.data.file_stamps import unchanged
 from offbench.data.minari_reader import episodes_of, open_minari, reading
 from offbench.envs.environments import box
 
@@ -57,29 +58,35 @@ def export(dataset_id: str, out: str | Path, *, style: str | None = None, drop_t
 
     Raises:
         OffbenchError: no such dataset, other spaces, damaged data, a file that ends otherwise than its format, no such
-            folder, or the disk refuses.
+            folder, the disk refuses, or the dataset was replaced meanwhile.
     """
     style = _style(Path(out), style)
     if drop_timeouts and style == "d4rl":
         raise OffbenchError("--drop-timeouts goes with --format npz: whoever reads a D4RL file drops them himself")
-    path, metadata, data = output_file(out), minari_store.read_metadata(dataset_id), open_minari(dataset_id)
-    for name in ("observation_space", "action_space"):
-        box(getattr(data, name), f"{dataset_id}: {name}")
-    if not data.total_steps:
-        raise OffbenchError(f"{dataset_id} has no transitions; record it again")
+    path = output_file(out)
     with disk_errors(str(path)), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         aside = Path(folder) / path.name
-        with Progress(int(data.total_steps), f"exporting {dataset_id}") as progress:
-            columns = _columns(data, dataset_id, progress)
-            if style == "d4rl":
-                _write_d4rl(aside, columns, _about(data, metadata))
-            else:
-                dropped = minari_store.provenance(metadata).get("timeouts") == "dropped"
-                _write_npz(aside, (_float32(part) for part in columns), drop_timeouts, dropped)
+        with unchanged(dataset_id):
+            _write(dataset_id, aside, style, drop_timeouts)
         with open(aside, "rb") as file:
             os.fsync(file.fileno())
         os.replace(aside, path)
     return path
+
+
+def _write(dataset_id: str, path: Path, style: str, drop_timeouts: bool) -> None:
+    metadata, data = minari_store.read_metadata(dataset_id), open_minari(dataset_id)
+    for name in ("observation_space", "action_space"):
+        box(getattr(data, name), f"{dataset_id}: {name}")
+    if not data.total_steps:
+        raise OffbenchError(f"{dataset_id} has no transitions; record it again")
+    with Progress(int(data.total_steps), f"exporting {dataset_id}") as progress:
+        columns = _columns(data, dataset_id, progress)
+        if style == "d4rl":
+            _write_d4rl(path, columns, _about(data, metadata))
+        else:
+            dropped = minari_store.provenance(metadata).get("timeouts") == "dropped"
+            _write_npz(path, (_float32(part) for part in columns), drop_timeouts, dropped)
 
 
 def _style(out: Path, style: str | None) -> str:

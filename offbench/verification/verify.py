@@ -19,6 +19,7 @@ from offbench.common.provenance import versions
 from offbench.common.seeds import Purpose
 from offbench.common.text import counted
 from offbench.data import minari_store
+from offbench.data.file_stamps import unchanged
 from offbench.data.minari_reader import Recorded, episodes_of, reading
 from offbench.data.recorded_env import margins_matter, recorded_margin, recorded_mujoco
 from offbench.envs.contact_margin import ADDED, EARLIER, SINCE, with_margin
@@ -48,8 +49,13 @@ def verify(dataset_id: str, *, episodes: int | None = None, workers: int | None 
         The report; `report.ok` is False if something is off. Damaged data are findings, not errors.
 
     Raises:
-        OffbenchError: no such dataset, or spaces other than flat Boxes.
+        OffbenchError: no such dataset, spaces other than flat Boxes, or it was replaced meanwhile.
     """
+    with unchanged(dataset_id):
+        return _verify(dataset_id, episodes, workers)
+
+
+def _verify(dataset_id: str, episodes: int | None, workers: int | None) -> Report:
     from offbench.data.minari_reader import open_minari  # here, because `verify --help` need not wait for Minari
 
     report, findings = Report(dataset_id), Findings()

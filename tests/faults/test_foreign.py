@@ -19,7 +19,7 @@ import pytest
 import offbench
 from offbench.common import files
 from offbench.data import file_stamps, transitions
-from offbench.data.minari_reader import open_minari
+from offbench.data.minari_reader import episodes_of, open_minari
 from offbench.rollouts.policy import uniform
 
 REWARDS = "episode_0/rewards"
@@ -178,6 +178,24 @@ def test_a_dataset_replaced_while_it_is_loaded(
     assert found.content == now.content == now.metadata["offbench"]["content_sha256"]
     for name in transitions.ARRAYS:
         np.testing.assert_array_equal(getattr(found, name), getattr(now, name))
+
+
+@pytest.mark.parametrize(
+    ("module", "read"),
+    [("data.export", lambda name: offbench.export(name, "out.npz")), ("verification.scan", offbench.verify)],
+)
+def test_a_dataset_replaced_while_it_is_exported_or_verified(
+    module: str, read: Callable[[str], Any], recorded: str, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def replaced(*arguments: Any) -> Any:
+        shutil.rmtree(home / "minari" / recorded)
+        offbench.collect("inverted-pendulum", "random", steps=301, dataset_id=recorded, workers=1)
+        return episodes_of(*arguments)
+
+    monkeypatch.setattr(f"offbench.{module}.episodes_of", replaced)
+    with pytest.raises(offbench.OffbenchError, match=f"{recorded} was replaced while it was read"):
+        read(recorded)
+    assert not list(home.glob("*out.npz*"))
 
 
 def test_reading_a_converted_dataset_takes_no_lock(recorded: str, home: Path) -> None:
