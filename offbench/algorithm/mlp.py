@@ -258,8 +258,8 @@ class _Half:
     def __init__(self, h: Array, weight: Array, out: Array, keep: bool) -> None:
         self._h, self._weight, self._out = map(torch.from_numpy, (h, weight, out))
         batch, (rows, columns) = len(h), weight.shape
-        factor = _halves if keep else _shared("factor", _halves)
-        self._half_h, self._half_weight = factor(batch, rows), factor(rows, columns)
+        self._half_h = (_halves if keep else _shared("inputs", _halves))(batch, rows)
+        self._half_weight = (_halves if keep else _shared("weights", _halves))(rows, columns)
         self._half_out = _shared("product", _halves)(batch, columns)
         if keep:
             self._half_gradient = _shared("gradient", _halves)(batch, columns)

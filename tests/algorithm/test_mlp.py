@@ -84,6 +84,18 @@ def test_bfloat16_is_near_float32_with_wide_layers(activation: str) -> None:
         assert 1e-4 < distance < 0.1  # rounded to 8 bits, more than once
 
 
+def test_bfloat16_without_gradients_has_the_same_bits_whatever_the_shapes() -> None:
+    """Without a backward pass buffers are shared, and here the inputs of a layer and its weights have one shape."""
+    sizes, batch = (14, 127, 128, 1), 128
+    flat, inputs, _ = made(sizes, batch, 2, 2)
+    ours = single([flat, *inputs])
+    with products_by("bfloat16"):
+        wanted = perceptrons(ours[0], ours[1:], sizes, "relu")
+        with torch.no_grad():
+            found = perceptrons(ours[0], ours[1:], sizes, "relu")
+    assert torch.equal(found, wanted)
+
+
 def test_bfloat16_leaves_narrow_layers_in_float32() -> None:
     sizes, batch = SHAPES[0]
     flat, inputs, _ = made(sizes, batch, 2, 2)
