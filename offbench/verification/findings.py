@@ -132,7 +132,7 @@ class Report:
         for title, items in (("checked", self.checked), ("skipped", self.skipped), ("warning", self.warnings)):
             lines += [f"  {title}  {item}" for item in items]
         lines += [f"  FOUND    {finding.line()}" for finding in self.findings]
-        return [*lines, "nothing found" if self.ok else counted(len(self.findings), "finding")]
+        return [*lines, "no problems found" if self.ok else counted(len(self.findings), "finding")]
 
     def to_json(self) -> str:
         """Return the report as JSON."""

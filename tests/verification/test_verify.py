@@ -350,7 +350,7 @@ def test_code_named_by_the_metadata_is_not_run(medium: str, home: Path) -> None:
 
 def test_the_command_line_tells_with_its_exit_code(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
     main(["verify", medium, "--workers", "1"])
-    assert "nothing found" in capsys.readouterr().out
+    assert "no problems found" in capsys.readouterr().out
     change_metadata(medium, content_sha256="0" * 64)
     with pytest.raises(SystemExit) as stopped:
         main(["verify", medium, "--workers", "1", "--json"])
