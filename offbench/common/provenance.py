@@ -34,7 +34,12 @@ def hardware() -> dict[str, Any]:
 
 def made_with(device: str, precision: str) -> dict[str, Any]:
     """Return what a run's numbers depend on beside its settings and seed: a `Session` of its config.json."""
-    return {"device": device, "precision": precision, "versions": versions(), **hardware()}
+    made = hardware()
+    if device != "cpu":
+        import torch
+
+        made["hardware"]["gpu"] = torch.cuda.get_device_name(device)
+    return {"device": device, "precision": precision, "versions": versions(), **made}
 
 
 def has_bfloat16() -> bool:

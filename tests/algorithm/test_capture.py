@@ -22,9 +22,9 @@ from offbench.training.registry import load_algorithm
 from offbench.training.stack import Stack
 
 
-def stack_of(kind: type, runs: int = 1, **settings: Any) -> Stack:
+def stack_of(kind: type, runs: int = 1, device: str = "cpu", **settings: Any) -> Stack:
     config: Any = build(kind.Config, settings, "test")  # type: ignore[attr-defined]
-    return random_stack(kind, [config] * runs, load_recipe("hopper").env_spec())
+    return random_stack(kind, [config] * runs, load_recipe("hopper").env_spec(), device)
 
 
 def trained(stack: Stack, steps: int) -> tuple[dict[str, Tensor], list[dict[str, float]]]:

@@ -1,15 +1,16 @@
 """A stack on a GPU: does a captured update equal a plain one, and what do many runs gain over one?
 
-    python -m tests.speed.gpu --out docs/benchmarks-gpu.json --seconds 480
+    python -m tests.speed.gpu --out docs/results/gpu.json --seconds 80
 
-Every figure is written as soon as it is measured; the same command goes on with those that are missing, so that a
-machine that is lent for minutes at a time is enough. On a CPU it does the same with small stacks (a rehearsal).
+Every figure is written as soon as it is measured. The same command measures those that are missing, so it can be run
+in slices. The table of all figures is written beside the file, with the suffix .md. On a CPU it measures small stacks.
 """
 
 from __future__ import annotations
 
 import argparse
 import datetime
+import gc
 import json
 import time
 from collections.abc import Callable
@@ -19,16 +20,17 @@ from typing import Any
 import torch
 
 from offbench.benchmarks.throughput import random_stack
-from offbench.common.files import write_json
+from offbench.common.files import write_bytes, write_json
 from offbench.common.provenance import versions
 from offbench.common.settings import build
+from offbench.common.tables import markdown
 from offbench.envs.recipes import load_recipe
 from offbench.training.devices import PRECISIONS, arithmetic, pick_device
 from offbench.training.registry import load_algorithm
 from offbench.training.stack import Stack
 
-MEASURE = 5.0  # seconds of a figure
-STACKS = (1, 5, 25, 125, 250)
+MEASURE = 1.0  # seconds of a figure
+STACKS = (1, 5, 25, 125)
 ALGORITHMS = ("bdb", "td3_bc", "cql")
 
 
@@ -52,6 +54,7 @@ def rate(algorithm: str, runs: int, device: str, *, captured: bool, precision: s
     """Return the sum of all runs' updates a second, and the peak memory in MB."""
     gpu = device != "cpu"
     if gpu:
+        gc.collect()  # of the stack before, which has reference cycles
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     with arithmetic(device, precision):
@@ -99,18 +102,36 @@ def figures(device: str) -> dict[str, Callable[[], dict[str, float]]]:
         found[f"{algorithm}, 1 run, plain"] = lambda a=algorithm: rate(
             a, 1, device, captured=False, precision="float32"
         )  # type: ignore[misc]
-        for runs in sizes[: 4 if algorithm == "cql" else None]:
+        for runs in sizes[: 3 if algorithm == "cql" else None]:
             for precision in PRECISIONS:
                 name = f"{algorithm}, {runs} runs, captured, {precision}"
                 found[name] = lambda a=algorithm, r=runs, p=precision: rate(a, r, device, captured=True, precision=p)  # type: ignore[misc]
     return found
 
 
+def table(results: dict[str, dict[str, float]]) -> str:
+    """Return the updates a second of all runs of a stack, by precision, as a Markdown table."""
+    rows = []
+    for algorithm in ALGORITHMS:
+        plain = results.get(f"{algorithm}, 1 run, plain", {}).get("updates_per_second")
+        if plain is None:
+            continue
+        rows.append([algorithm, "1, not captured", f"{plain:,.0f}", "", "", "1"])
+        for runs in STACKS:
+            cells = [results.get(f"{algorithm}, {runs} runs, captured, {p}", {}) for p in PRECISIONS]
+            rates = [f"{cell['updates_per_second']:,.0f}" if "updates_per_second" in cell else "" for cell in cells]
+            if any(rates):
+                gain = f"{cells[0]['updates_per_second'] / plain:.0f}" if rates[0] else ""
+                rows.append([algorithm, str(runs), *rates, gain])
+    header = ["algorithm", "runs in the stack", *PRECISIONS, "float32 against one run not captured"]
+    return "\n".join(markdown(header, rows)) + "\n"
+
+
 def main() -> None:
     """Measure what is missing, for as long as there is time."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks-gpu.json"))
-    parser.add_argument("--seconds", type=float, default=480.0, help="after which no new figure is begun")
+    parser.add_argument("--out", type=Path, default=Path("docs/results/gpu.json"))
+    parser.add_argument("--seconds", type=float, default=80.0, help="after which no new figure is begun")
     parser.add_argument("--device", default="auto")
     arguments = parser.parse_args()
     device, began = pick_device(arguments.device), time.monotonic()
@@ -124,7 +145,7 @@ def main() -> None:
         if what in results:
             continue
         if time.monotonic() - began > arguments.seconds:
-            print("out of time; the same command goes on")
+            print("out of time; rerun the command to measure the rest")
             break
         try:
             results[what] = measure()
@@ -132,6 +153,7 @@ def main() -> None:
             results[what] = {"out_of_memory": 1.0}
         print(what, results[what], flush=True)
         write_json(arguments.out, known)
+    write_bytes(arguments.out.with_suffix(".md"), table(results).encode())
 
 
 if __name__ == "__main__":

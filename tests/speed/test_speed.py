@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.speed import profile
+from tests.speed import gpu, profile
 from tests.speed.__main__ import environment, line
 from tests.speed.rows import peer, side
 from tests.speed.side import Side
@@ -57,3 +58,11 @@ def test_a_row_that_misses_its_target_says_so() -> None:
     assert line(found | {"at_least": 0.6, "aim": 0.8})[4] == "**no**"
     assert line(found | {"at_least": 0.59, "aim": 0.8})[4] == "yes"
     assert line(found | {"at_least": None, "aim": None})[4] == ""
+
+
+def test_the_gpu_table_shows_the_committed_figures() -> None:
+    results = Path(__file__).parents[2] / "docs" / "results"
+    figures = json.loads((results / "gpu.json").read_text())["figures"]
+    text = (results / "gpu.md").read_text()
+    assert text == gpu.table(figures)
+    assert f"| {figures['bdb, 25 runs, captured, tf32']['updates_per_second']:,.0f} |" in text
