@@ -32,7 +32,7 @@ from offbench.training.spec import Job
 from offbench.training.stack import Stack, slice_of
 
 LOG_EVERY = 1000  # updates per row of losses.csv
-QUICK = 0.1  # seconds; a checkpoint that takes longer is not written at every evaluation
+QUICK = 1.0  # seconds; a checkpoint that takes longer is not written at every evaluation
 SHARE = 0.05  # of the time that slow checkpoints may take
 
 STOPPED = "stopped with a checkpoint"  # the last note of a training that was interrupted
