@@ -99,7 +99,8 @@ def list_arguments(parser: Parser, _: list[str]) -> None:
         for title, header, rows in sections(contents):
             say(title, "bold")
             if header:
-                print_table(header, rows, names=2 if title == "runs" else 1)
+                is_runs = title == "runs"
+                print_table(header, rows, names=2 if is_runs else 1, group=is_runs)
             else:
                 print("\n".join(f"  {row[0]}" for row in rows))
             print()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from offbench.agents.ladder import read_ladder
 from offbench.common.errors import OffbenchError
@@ -14,6 +14,9 @@ from offbench.data.levels import LEVELS
 from offbench.envs.recipes import load_recipe, names
 from offbench.training.registry import algorithm_names
 
+if TYPE_CHECKING:
+    from offbench.analysis.results import Trained
+
 
 def inventory(what: str | None = None, *, runs: str | Path = "runs") -> dict[str, Any]:
     """Return what is here.
@@ -21,10 +24,12 @@ def inventory(what: str | None = None, *, runs: str | Path = "runs") -> dict[str
     Args:
         what: `environments` (with their shipped ladders), `levels`, `algorithms`, `datasets` (local ones) or `runs`;
             None for all but the runs.
-        runs: the folder of the runs.
+        runs: the folder of the runs. A run's `step` is the newest that was evaluated, 0 if none was; `score` and
+            `d4rl_score` are those of `offbench.normalize`, None without such a reference.
 
     Raises:
-        OffbenchError: the folder of the runs holds none, or an unknown `what`.
+        OffbenchError: an unknown `what`, or the same run is there twice. Damaged runs are named on stderr and left
+            out.
     """
     parts: dict[str, Callable[[], Any]] = {
         "environments": _environments,
@@ -68,11 +73,13 @@ def _datasets() -> dict[str, Any]:
 
 
 def _runs(root: str | Path) -> list[dict[str, Any]]:
-    from offbench.analysis.results import read_results
+    from offbench.analysis.methods import method_of
+    from offbench.analysis.results import entries_of
+    from offbench.training.run import find_runs
 
-    results = read_results(root)
+    entries, waiting = entries_of(find_runs(Path(root)))
     rows: list[dict[str, Any]] = []
-    for entry in results.entries.values():
+    for entry in entries:
         rows += [
             {
                 "dataset": entry.task.name,
@@ -81,11 +88,34 @@ def _runs(root: str | Path) -> list[dict[str, Any]]:
                 "step": trained.reached,
                 "steps": trained.steps,
                 "state": trained.state,
+                "return": trained.score(None),
+                "score": _score(trained, "dataset"),
+                "d4rl_score": _score(trained, "d4rl"),
                 "folder": str(trained.run.folder),
             }
             for trained in entry.runs
         ]
+    for run in waiting:
+        config = run.config()
+        rows.append(
+            {
+                "dataset": config.dataset,
+                "method": config.label or method_of(config.algorithm, config.variant, config.settings).label,
+                "seed": config.seed,
+                "step": 0,
+                "steps": config.steps,
+                "state": "diverged" if run.diverged else "unfinished",
+                "return": None,
+                "score": None,
+                "d4rl_score": None,
+                "folder": str(run.folder),
+            }
+        )
     return rows
+
+
+def _score(trained: Trained, reference: str) -> float | None:
+    return trained.score(reference) if trained.config.references.get(reference) else None
 
 
 Section = tuple[str, list[str], list[list[str]]]
@@ -109,11 +139,23 @@ def sections(contents: Mapping[str, Any]) -> Iterator[Section]:
         header = ["id", "transitions", "episodes"] if rows else []
         yield f"datasets in {minari_store.root()}", header, rows or none
     if "runs" in contents:
-        rows = [
-            [run["dataset"], run["method"], str(run["seed"]), f"{run['step']:,}", f"{run['steps']:,}", run["state"]]
-            for run in contents["runs"]
+        yield _run_section(contents["runs"])
+
+
+def _run_section(runs: Sequence[Mapping[str, Any]]) -> Section:
+    if not runs:
+        return "runs", [], [["none; start one with `offbench train ALGO --dataset ID`"]]
+    titles = {"score": "score", "d4rl_score": "D4RL score"}
+    scores = [key for key in titles if any(run[key] is not None for run in runs)] or ["return"]
+    rows = [
+        [
+            *(run["dataset"], run["method"], str(run["seed"]), f"{run['step']:,}", f"{run['steps']:,}"),
+            *("-" if run[key] is None else f"{run[key] + 0.0:.1f}" for key in scores),
+            run["state"],
         ]
-        yield "runs", ["dataset", "method", "seed", "step", "of", "state"], rows
+        for run in runs
+    ]
+    return "runs", ["dataset", "method", "seed", "step", "of", *(titles.get(k, k) for k in scores), "state"], rows
 
 
 def _transitions(data: Mapping[str, Any]) -> str:

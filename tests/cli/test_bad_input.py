@@ -98,7 +98,6 @@ CASES: dict[str, tuple[str, str]] = {
     "normalize --env hopper nan": ("returns must be finite numbers", ""),
     "normalize --format html": ("invalid choice: 'html'", ""),
     "list files": ("invalid choice: 'files'", "runs"),
-    "list runs": ("no evaluated runs below runs", "offbench train"),
     "report --runs nowhere here": ("no evaluated runs below nowhere, here", "offbench train"),
     "compare td3_bc": ("the following arguments are required: B", "--help"),
     "compare td3_bc cql --runs nowhere": ("no evaluated runs below nowhere", ""),
