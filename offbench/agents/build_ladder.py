@@ -142,8 +142,8 @@ class RungEvaluator:
                 return step
             if self._crosses(before, step, target, most):
                 half = (most - target) / 2
-                if (found := self._first_close(self._screen_between(before, step), target + half, half)) is not None:
-                    return found
+                if (rung := self._first_close(self._screen_between(before, step), target + half, half)) is not None:
+                    return rung
         return self.nearest(target, most - target, early)
 
     def nearest(self, target: float, close: float, among: Iterable[int] | None = None) -> int:
@@ -158,14 +158,14 @@ class RungEvaluator:
             among: the rungs to choose from, with the policies between them (default: all).
         """
         steps = sorted(self.screened if among is None else among)
-        if (found := self._first_close(steps, target, close)) is not None:
-            return found
+        if (close_enough := self._first_close(steps, target, close)) is not None:
+            return close_enough
         candidates = list(steps)
         crossings = (pair for pair in pairwise([0, *steps]) if self._crosses(*pair, target - close, target + close))
         for pair in list(itertools.islice(crossings, CROSSINGS)):
             candidates += self._screen_between(*pair)
-            if (found := self._first_close(candidates, target, close)) is not None:
-                return found
+            if (close_enough := self._first_close(candidates, target, close)) is not None:
+                return close_enough
         return min((s for s in candidates if s in self.measured), key=lambda step: abs(self.measure(step) - target))
 
     def _first_close(self, steps: Sequence[int], target: float, close: float) -> int | None:

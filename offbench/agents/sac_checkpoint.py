@@ -44,7 +44,7 @@ def save_segment_end(folder: TrainingFolder, model: SAC, seconds: float) -> None
 
 
 def save_within_segment(folder: TrainingFolder, model: SAC, seconds: float) -> None:
-    """Write a checkpoint within a segment, in place of an earlier one within it."""
+    """Write a checkpoint within a segment; it replaces an earlier one of the same segment."""
     step, segment = model.num_timesteps, folder.recipe.sac.segment
     arrays = transitions_since(model, step - step % segment)
     tensors = {f"transitions.{name}": torch.from_numpy(array) for name, array in arrays.items()}

@@ -108,8 +108,8 @@ def _joined(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
 
 def _sequence(tensors: Mapping[str, Array], name: str) -> Layers:
     """Return the linear layers of a torch.nn.Sequential, in order."""
-    found = (re.fullmatch(rf"{re.escape(name)}\.(\d+)\.weight", key) for key in tensors)
-    return tuple(_layer(tensors, f"{name}.{place}") for place in sorted(int(match[1]) for match in found if match))
+    matches = (re.fullmatch(rf"{re.escape(name)}\.(\d+)\.weight", key) for key in tensors)
+    return tuple(_layer(tensors, f"{name}.{index}") for index in sorted(int(match[1]) for match in matches if match))
 
 
 def _activation(path: Path, settings: Mapping[str, Any], default: str) -> str:

@@ -94,7 +94,7 @@ class Recording:
     def finish(self) -> None:
         """Leave out of the replay what only fills constants."""
         left_out = set(self._constants.values())
-        self.calls = [call for place, call in enumerate(self.calls) if place not in left_out]
+        self.calls = [call for index, call in enumerate(self.calls) if index not in left_out]
 
     def keep(self, tensors: Any) -> None:
         """Keep tensors alive as long as this record."""
@@ -219,9 +219,9 @@ def _single(func: Any, args: Any, kwargs: Any) -> Call:
 
 
 def _tensors(nested: Any) -> list[Tensor]:
-    found: list[Tensor] = []
-    tree_map_only(Tensor, found.append, nested)
-    return found
+    tensors: list[Tensor] = []
+    tree_map_only(Tensor, tensors.append, nested)
+    return tensors
 
 
 def _address(tensor: Tensor) -> int:
@@ -246,12 +246,12 @@ def _in_place(func: Any, args: Any, kwargs: Any, result: Any) -> Call:
     whole = all(isinstance(output, Tensor) for output in outputs)  # a backward pass has None where nobody asks
     if whole and func not in _OUT:
         _OUT[func] = next(
-            (variant for variant in _variants(func, len(outputs)) if _agrees(variant, args, kwargs, outputs)),
+            (one for one in _variants(func, len(outputs)) if _agrees(one, args, kwargs, outputs)),
             None,
         )
-    found = _OUT[func] if whole else None
-    if found is not None:
-        function, names = found
+    variant = _OUT[func] if whole else None
+    if variant is not None:
+        function, names = variant
         if len(names) == 1 or function is not getattr(torch, func.overloadpacket.__name__, None):
             return function, args, {**kwargs, **dict(zip(names, outputs, strict=True))}
         return function, args, {**kwargs, "out": tuple(outputs)}

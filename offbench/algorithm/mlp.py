@@ -103,11 +103,11 @@ class _Perceptrons(torch.autograd.Function):
         with one_call() as recording:
             back = PassBack(ctx.made, flat, grads[0], *needs)
             back.run()
-        found = (back.of_flat, *back.of_inputs)
+        gradients = (back.of_flat, *back.of_inputs)
         if recording:
-            reads, writes = (ctx.made.outputs, grads[0]), [one for one in found if one is not None]
+            reads, writes = (ctx.made.outputs, grads[0]), [gradient for gradient in gradients if gradient is not None]
             recording.add(("backward", needs), reads, writes, (back.run, (), {}))
-        return found[0], None, None, None, *found[1:]
+        return gradients[0], None, None, None, *gradients[1:]
 
 
 class Pass:
@@ -220,9 +220,9 @@ class PassBack:
                     g = before
                     continue
                 start = 0
-                for width, found in zip(widths, self.of_inputs, strict=True):
-                    if found is not None:
-                        part, of_input = weight[start : start + width].T, _array(found)[run]
+                for width, gradient in zip(widths, self.of_inputs, strict=True):
+                    if gradient is not None:
+                        part, of_input = weight[start : start + width].T, _array(gradient)[run]
                         if member == 0:
                             self._product(g, part, of_input)
                         else:
@@ -277,15 +277,15 @@ class _Half:
         """Take the gradient of `out`, [batch, out], of which the other gradients follow."""
         self._half_gradient.copy_(gradient)
 
-    def of_weight(self, found: Tensor) -> None:
+    def of_weight(self, out: Tensor) -> None:
         """Compute the gradient of `weight`."""
         torch.mm(self._half_h.T, self._half_gradient, out=self._half_of_weight)
-        found.copy_(self._half_of_weight)
+        out.copy_(self._half_of_weight)
 
-    def of_h(self, found: Tensor) -> None:
+    def of_h(self, out: Tensor) -> None:
         """Compute the gradient of `h` without its ones, [batch, in]."""
         torch.mm(self._half_gradient, self._half_weight[:-1].T, out=self._half_of_h)
-        found.copy_(self._half_of_h)
+        out.copy_(self._half_of_h)
 
 
 def _halves(rows: int, columns: int) -> Tensor:

@@ -289,15 +289,17 @@ def _flattening(space: gym.Space[Any], what: str) -> str:
 
 def action_box(space: gym.Space[Any], what: str) -> gym.spaces.Box:
     """Return `space` if it is a flat float Box with bounds that actions can be scaled by, else raise OffbenchError."""
-    found = box(space, what)
-    if not (np.isfinite(found.low).all() and np.isfinite(found.high).all()):
-        raise OffbenchError(f"{what} must be bounded to be scaled, not {found}")
-    largest = max(np.abs(found.low).max(), np.abs(found.high).max())
+    actions = box(space, what)
+    if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
+        raise OffbenchError(f"{what} must be bounded to be scaled, not {actions}")
+    largest = max(np.abs(actions.low).max(), np.abs(actions.high).max())
     if largest > LARGEST_BOUND:
         raise OffbenchError(
             f"{what} must be bounded to be scaled; a bound of {largest:.3g} is none (at most {LARGEST_BOUND:,.0f}): "
             "correct the action space to what the environment takes"
         )
-    if not (found.low < found.high).all():
-        raise OffbenchError(f"{what}: a lower bound is not below its upper bound in {found}; correct the action space")
-    return found
+    if not (actions.low < actions.high).all():
+        raise OffbenchError(
+            f"{what}: a lower bound is not below its upper bound in {actions}; correct the action space"
+        )
+    return actions

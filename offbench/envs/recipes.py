@@ -1,7 +1,7 @@
 """Recipes: all that is particular to one environment, in one TOML file.
 
-A shipped recipe is known by its folder's name (`hopper`); anybody else's is a file given by path
-(`./my-env.toml`). Algorithms and levels know no environment by name.
+A shipped recipe is named by its folder (`hopper`), any other by the path of its file (`./my-env.toml`).
+Algorithms and levels know no environment by name.
 """
 
 from __future__ import annotations

@@ -99,16 +99,16 @@ def _check_class(entry_point: Any, base: type) -> None:
         raise OffbenchError(
             f"it would run {entry_point}, which is not among the {kind} that a file may name; {REMEDY}"
         )
-    found = getattr(importlib.import_module(names[1]), names[2], None)
-    if not (isinstance(found, type) and issubclass(found, base)):
+    cls = getattr(importlib.import_module(names[1]), names[2], None)
+    if not (isinstance(cls, type) and issubclass(cls, base)):
         raise OffbenchError(f"its entry point {entry_point!r} is no {base.__name__} class, it is not run")
 
 
 def _is_allowed(module: str, name: str, base: type) -> bool:
     if base is gym.Wrapper:
         return f"{module}.".startswith("gymnasium.wrappers.") and name in WRAPPERS
-    known = (spec.entry_point for spec in gym.registry.values())
-    return f"{module}.".startswith(PACKAGES) or f"{module}:{name}" in known
+    registered = (spec.entry_point for spec in gym.registry.values())
+    return f"{module}.".startswith(PACKAGES) or f"{module}:{name}" in registered
 
 
 class _Plain:

@@ -295,9 +295,9 @@ def _check_shapes(p: Policy) -> None:
 def check_networks(parts: Policy | PolicyParts, observations: int, actions: int) -> None:
     """Raise ValueError if the kind is unknown, or the layers do not lead from observations to its outputs."""
     if parts.kind not in KINDS:
-        raise ValueError(f"unknown kind {parts.kind!r}; known: {', '.join(KINDS)}")
+        raise ValueError(f"unknown kind {parts.kind!r}; the kinds are {', '.join(KINDS)}")
     if not isinstance(parts.activation, str) or parts.activation not in ACTIVATIONS:
-        raise ValueError(f"unknown activation {parts.activation!r}; known: {', '.join(ACTIVATIONS)}")
+        raise ValueError(f"unknown activation {parts.activation!r}; the activations are {', '.join(ACTIVATIONS)}")
     if not isinstance(parts.samples, int) or not 1 <= parts.samples <= MOST_SAMPLES:
         raise ValueError(f"samples must be a whole number from 1 to {MOST_SAMPLES}, not {parts.samples!r}")
     if parts.kind == "uniform":
