@@ -7,6 +7,7 @@ read_back   metadata that offbench wrote as JSON (a run's config.json) to a data
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import re
 import types
@@ -18,6 +19,7 @@ from typing import Any, TypeVar
 from offbench.common.errors import DamagedError, OffbenchError, unknown
 
 T = TypeVar("T")
+_type_hints = functools.cache(typing.get_type_hints)  # evaluating them takes most of the time of reading a config.json
 
 
 def setting(
@@ -116,7 +118,7 @@ def check(cls: type, name: str, value: Any, where: str, *, parse: bool = True) -
     Args:
         parse: whether text may stand for a number, a list and so on, as on a command line.
     """
-    hint = typing.get_type_hints(cls)[name]
+    hint = _type_hints(cls)[name]
     try:
         value = _convert(value, hint, parse)
     except (TypeError, ValueError, OverflowError):
