@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from offbench.analysis.compare import favoured
+from offbench.analysis.compare import favored
 from offbench.analysis.statistics import iqm, paired
 from offbench.common.tables import markdown
 
@@ -38,7 +38,7 @@ def simulate(tasks: int, seeds: int, simulations: int = SIMULATIONS) -> tuple[fl
         counts += [
             covers(mean.low, mean.high),
             not covers(found.difference.low, found.difference.high),
-            bool(favoured(found)),
+            bool(favored(found)),
         ]
     first, second, third = counts / simulations
     return float(first), float(second), float(third)

@@ -68,24 +68,24 @@ class Comparison:
         over += f" on {len(sizes)} datasets" if len(sizes) > 1 else ""
         if not self.comparable:
             return "no verdict: the scores are of evaluations at different steps"
-        sign = favoured(self.statistics)
+        sign = favored(self.statistics)
         if not sign:
             return f"no evidence of a difference at {over}"
         return f"{self.a if sign > 0 else self.b} is better: +{estimate if sign > 0 else -estimate} at {over}"
 
     def lines(self) -> list[str]:
         """Return the comparison as text."""
-        found = self.statistics
-        effect = "-" if found.standardised is None else f"{found.standardised:+.2f}"
+        statistics = self.statistics
+        effect = "-" if statistics.standardized is None else f"{statistics.standardized:+.2f}"
         percent = self.chance.percent()
         lines = [f"{self.a} against {self.b} ({self.reference})", ""]
         lines += [
             *self._pair_lines(),
             "",
-            f"mean difference             {found.difference.value:+.1f} {found.difference.span()}".rstrip(),
-            f"standardized                {effect} (over the deviation of the {found.pairs} paired differences)",
+            f"mean difference             {statistics.difference.value:+.1f} {statistics.difference.span()}".rstrip(),
+            f"standardized                {effect} (over the deviation of the {statistics.pairs} paired differences)",
             f"probability of improvement  {percent.value:.0f}% {percent.span()}".rstrip(),
-            f"sign-flip test              p = {found.p:.3g}",
+            f"sign-flip test              p = {statistics.p:.3g}",
         ]
         if not self.comparable:
             lines.append(
@@ -113,16 +113,16 @@ class Comparison:
 
     def row(self) -> dict[str, Any]:
         """Return the comparison as JSON has it."""
-        found, chance = self.statistics, self.chance
+        statistics, chance = self.statistics, self.chance
         return {
             "a": self.a,
             "b": self.b,
             "reference": self.reference,
-            "difference": found.difference.value,
-            "low": found.difference.low,
-            "high": found.difference.high,
-            "standardised": found.standardised,
-            "p": found.p,
+            "difference": statistics.difference.value,
+            "low": statistics.difference.low,
+            "high": statistics.difference.high,
+            "standardized": statistics.standardized,
+            "p": statistics.p,
             "probability_of_improvement": chance.value,
             "probability_low": chance.low,
             "probability_high": chance.high,
@@ -191,22 +191,22 @@ def comparable(both: Partners) -> bool:
 
 def differences(both: Partners) -> dict[str, list[float]]:
     """Return {task: score of A's run minus score of B's, for each pair}."""
-    found: dict[str, list[float]] = {}
+    by_task: dict[str, list[float]] = {}
     for task, one, other in both:
-        found.setdefault(task.name, []).append(one.score(task.reference) - other.score(task.reference))
-    return found
+        by_task.setdefault(task.name, []).append(one.score(task.reference) - other.score(task.reference))
+    return by_task
 
 
-def favoured(found: Paired) -> int:
+def favored(statistics: Paired) -> int:
     """Return 1 if A is better, -1 if B is, 0 if there is no evidence: interval and sign-flip test must agree."""
-    low, high = found.difference.low, found.difference.high
-    if low is None or high is None or low <= 0 <= high or found.p > LEVEL:
+    low, high = statistics.difference.low, statistics.difference.high
+    if low is None or high is None or low <= 0 <= high or statistics.p > LEVEL:
         return 0
     return 1 if low > 0 else -1
 
 
 def _by_dataset(pairs: Iterable[Pair], value: Callable[[Pair], float]) -> dict[str, list[float]]:
-    found: dict[str, list[float]] = {}
+    values: dict[str, list[float]] = {}
     for pair in pairs:
-        found.setdefault(pair.dataset, []).append(value(pair))
-    return found
+        values.setdefault(pair.dataset, []).append(value(pair))
+    return values

@@ -84,7 +84,7 @@ def name_methods(configs: Mapping[tuple[str, str], Sequence[RunConfig]]) -> dict
     Args:
         configs: the config.json of every run of each method.
     """
-    plain = {key: method_of(*key, found[0].settings) for key, found in configs.items()}
+    plain = {key: method_of(*key, runs[0].settings) for key, runs in configs.items()}
     names = {}
     for key, method in plain.items():
         labels = {config.label for config in configs[key]}
@@ -140,7 +140,7 @@ def _beta(value: Any) -> str | None:
 
 
 def rank(name: str, order: Sequence[str]) -> tuple[int, str]:
-    """Return what sorts a name by its place in an order, those outside it last and by name."""
+    """Return a sort key: the position of a name in `order`; names not in `order` come last, sorted."""
     return (order.index(name) if name in order else len(order), name)
 
 

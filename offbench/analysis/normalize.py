@@ -101,7 +101,7 @@ def score_returns(env: str, returns: Sequence[float], behaviour_dir: str | Path 
         raise OffbenchError(f"returns must be finite numbers, not {list(returns)}")
     folders = [recipe.folder / "behaviour"] if recipe.folder else []
     folders.append(Path(behaviour_dir) / recipe.name / "seed-0" / "ladder")
-    ladder = next((found.check(recipe) for folder in folders if (found := read_ladder(folder))), None)
+    ladder = next((candidate.check(recipe) for folder in folders if (candidate := read_ladder(folder))), None)
     ours = (ladder.random_return, ladder.expert_return) if ladder else None
     d4rl = (recipe.d4rl_min, recipe.d4rl_max) if recipe.d4rl_min is not None else None
     if not ours and not d4rl:

@@ -53,11 +53,11 @@ class Task:
         return f"{self.dataset} ({self.content[:DIGITS]})" if self.twin else self.dataset
 
     @property
-    def place(self) -> tuple[str, str]:
-        """(environment, level) by the dataset's id; the level is empty where the id has none."""
+    def env_and_level(self) -> tuple[str, str]:
+        """(environment, level), read from the dataset id; the level is "" if the id has none."""
         stem = re.sub(r"-v\d+$", "", self.dataset)
-        found = re.fullmatch(rf"(.+?)[-/]({'|'.join(sorted(LEVELS, key=len, reverse=True))}|\d+percent)", stem)
-        return (found[1].split("/")[-1], found[2]) if found else (stem, "")
+        match = re.fullmatch(rf"(.+?)[-/]({'|'.join(sorted(LEVELS, key=len, reverse=True))}|\d+percent)", stem)
+        return (match[1].split("/")[-1], match[2]) if match else (stem, "")
 
 
 @dataclass(frozen=True)
@@ -229,8 +229,8 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
         wanted = {find_method(every, name) for name in methods}
         entries, waiting = [entry for entry in entries if entry.method in wanted], []
     tasks = dict.fromkeys(entry.task for entry in entries)
-    found = sorted({entry.method for entry in entries}, key=method_order)
-    return Results(roots, tuple(tasks), tuple(found), {(e.task, e.method): e for e in entries}, tuple(waiting))
+    ordered = sorted({entry.method for entry in entries}, key=method_order)
+    return Results(roots, tuple(tasks), tuple(ordered), {(e.task, e.method): e for e in entries}, tuple(waiting))
 
 
 def window_words(runs: Iterable[Trained]) -> str:
@@ -238,7 +238,7 @@ def window_words(runs: Iterable[Trained]) -> str:
     windows = [trained.window for trained in runs]
     fewest, most = (len(f(windows, key=len)) for f in (min, max))
     count = counted(most, "evaluation") if fewest == most else f"{fewest} to {most} evaluations"
-    first, last = min(found[0] for found in windows), max(found[-1] for found in windows)
+    first, last = min(steps[0] for steps in windows), max(steps[-1] for steps in windows)
     return f"{count}, " + (f"step {last:,}" if first == last else f"steps {first:,} to {last:,}")
 
 
@@ -288,11 +288,11 @@ def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[Trained]]) -> dic
     for key, group in groups.items():
         runs.setdefault(key[:2], []).extend(group)
     ids = [dataset for dataset, _ in runs]
-    found = {}
+    tasks = {}
     for (dataset, content), group in runs.items():
-        known = [name for name in ("dataset", "d4rl") if all(t.config.references.get(name) for t in group)]
-        found[dataset, content] = Task(dataset, content, known[0] if known else None, ids.count(dataset) > 1)
-    return found
+        references = [name for name in ("dataset", "d4rl") if all(t.config.references.get(name) for t in group)]
+        tasks[dataset, content] = Task(dataset, content, references[0] if references else None, ids.count(dataset) > 1)
+    return tasks
 
 
 def _check_seeds(runs: Sequence[Trained]) -> None:
@@ -305,5 +305,5 @@ def _check_seeds(runs: Sequence[Trained]) -> None:
 
 
 def _task_order(task: Task) -> tuple[Any, ...]:
-    env, level = task.place
+    env, level = task.env_and_level
     return rank(level, tuple(LEVELS)), rank(env, ENV_ORDER), task.dataset, task.content

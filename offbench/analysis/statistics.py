@@ -70,16 +70,16 @@ def improvement(a: Scores, b: Scores) -> Estimate:
         OffbenchError: they share no task.
     """
     tasks = common(a, b)
-    pair = [{task: found[task] for task in tasks} for found in (a, b)]
+    pair = [{task: scores[task] for task in tasks} for scores in (a, b)]
     return _estimate(pair, lambda drawn: _above(*drawn), RESAMPLES)
 
 
 def profile(scores: Scores, taus: Sequence[float]) -> list[Estimate]:
     """Return the performance profile: for each tau the fraction of runs that score above it."""
     drawn = _draw(scores, CURVE_RESAMPLES)
-    found = [_fraction(_exact(scores), tau)[0] for tau in taus]
+    fractions = [_fraction(_exact(scores), tau)[0] for tau in taus]
     spread = [_fraction(drawn, tau) if drawn else None for tau in taus]
-    return [_with_interval(float(value), values) for value, values in zip(found, spread, strict=True)]
+    return [_with_interval(float(value), values) for value, values in zip(fractions, spread, strict=True)]
 
 
 def curve(seeds: Array) -> list[Estimate]:
@@ -98,13 +98,13 @@ class Paired:
 
     Attributes:
         difference: of normalized scores, mean over seeds, then over tasks.
-        standardised: mean over standard deviation of all pairs' differences; None where they do not vary.
+        standardized: mean over standard deviation of all pairs' differences; None where they do not vary.
         p: of a sign-flip test, two-sided: how often a difference as large comes about if A and B are alike.
         pairs: how many pairs there are.
     """
 
     difference: Estimate
-    standardised: float | None
+    standardized: float | None
     p: float
     pairs: int
 
@@ -161,8 +161,8 @@ def _estimate(groups: Sequence[Scores], statistic: Callable[[list[list[Array]]],
     """Return a statistic of groups of runs, each resampled independently of the others."""
     value = float(statistic([_exact(scores) for scores in groups])[0])
     drawn = [_draw(scores, resamples, stream) for stream, scores in enumerate(groups)]
-    known = [parts for parts in drawn if parts is not None]
-    return _with_interval(value, statistic(known) if len(known) == len(groups) else None)
+    complete = [parts for parts in drawn if parts is not None]
+    return _with_interval(value, statistic(complete) if len(complete) == len(groups) else None)
 
 
 def _with_interval(value: float, resampled: Array | None) -> Estimate:

@@ -80,14 +80,14 @@ def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
     path = recipe.folder / "card.json" if recipe.folder else None
     if path is None or not path.exists():
         return None
-    known = read_json(path)
-    if level not in known["levels"]:
+    card = read_json(path)
+    if level not in card["levels"]:
         return None
-    contents = known["levels"][level]["content_sha256"]
+    contents = card["levels"][level]["content_sha256"]
     if content_sha256 in contents.values():
         return "content equal to the dataset card's, bit for bit"
     here = versions()["mujoco"]
-    made = known["versions"] | {"mujoco": here if here in contents else next(iter(contents))}
+    made = card["versions"] | {"mujoco": here if here in contents else next(iter(contents))}
     others = [f"{name} {version}" for name, version in made.items() if versions()[name] != version]
     reason = f"made with {', '.join(others)}" if others else "made with the same versions: another processor or libm?"
     return f"warning: content differs from the dataset card's, {reason}"
@@ -99,10 +99,10 @@ def _keep_hashes(recipe: Recipe, facts: dict[str, dict[str, Any]], mujoco: str) 
     Its replay is what tells whether the shipped card is of the same ladder: no simulator has a part in it.
     """
     path = recipe.folder / "card.json" if recipe.folder else None
-    known = read_json(path)["levels"] if path is not None and path.exists() else {}
-    same = known and facts["medium-replay"]["content_sha256"] in known["medium-replay"]["content_sha256"].values()
+    shipped = read_json(path)["levels"] if path is not None and path.exists() else {}
+    same = shipped and facts["medium-replay"]["content_sha256"] in shipped["medium-replay"]["content_sha256"].values()
     for level, values in facts.items():
-        others = known[level]["content_sha256"] if same else {}
+        others = shipped[level]["content_sha256"] if same else {}
         values["content_sha256"] = {mujoco: values["content_sha256"]} | {
             v: c for v, c in others.items() if v != mujoco
         }
@@ -113,29 +113,29 @@ def _recorded(recipe: Recipe, ladder: Ladder, level: str, collect: str) -> Summa
     dataset_id = f"{recipe.name}-{level}-v{recipe.version}"
     if dataset_id not in minari_store.local_ids():
         raise OffbenchError(f"{dataset_id} is not recorded yet; first `{collect} --level {level}`")
-    found = show(dataset_id)
-    ours = minari_store.provenance(found.metadata)
+    summary = show(dataset_id)
+    ours = minari_store.provenance(summary.metadata)
     parts = LEVELS[level]
     size = full_size(parts, recipe.dataset_steps)
     if parts[0].source == "replay":
         size = int(ladder.info["medium_replay"]["transitions"])
     same = ours.get("references") == ladder.info["references"] and ours.get("seed") == 0
-    if not same or int(found.lengths.sum()) != size:
+    if not same or int(summary.lengths.sum()) != size:
         raise OffbenchError(
             f"{dataset_id} is not the level that is shipped (seed 0, {size:,.0f} transitions, this ladder); "
             f"record it with `{collect} --level {level} --overwrite`"
         )
-    return found
+    return summary
 
 
-def _facts(recipe: Recipe, found: Summary) -> dict[str, Any]:
-    meta, returns = found.metadata, np.asarray(found.returns)
+def _facts(recipe: Recipe, summary: Summary) -> dict[str, Any]:
+    meta, returns = summary.metadata, np.asarray(summary.returns)
     mean = float(returns.mean())
     d4rl = None
     if recipe.d4rl_min is not None and recipe.d4rl_max is not None:
         d4rl = round(normalize(mean, recipe.d4rl_min, recipe.d4rl_max), 2)
     return {
-        "transitions": int(found.lengths.sum()),
+        "transitions": int(summary.lengths.sum()),
         "episodes": len(returns),
         "return": round(mean, 2),
         "std": round(float(returns.std()), 2),
@@ -143,7 +143,7 @@ def _facts(recipe: Recipe, found: Summary) -> dict[str, Any]:
         "max": round(float(returns.max()), 2),
         "score": round(normalize(mean, float(meta["ref_min_score"]), float(meta["ref_max_score"])), 2) + 0.0,  # no -0
         "d4rl_score": d4rl,
-        "terminated": round(found.terminated, 4),
+        "terminated": round(summary.terminated, 4),
         "content_sha256": minari_store.provenance(meta)["content_sha256"],
     }
 
@@ -229,14 +229,14 @@ def _draw(recipe: Recipe, ladder: Ladder, levels: Mapping[str, Summary], path: P
         left.plot([r.step for r in kept], [r.ret for r in kept], "o", markersize=4, color=RED, label="kept")
         left.set(xlabel="environment steps", ylabel="return", title=f"SAC on {recipe.env_id}")
         left.legend(frameon=False)
-        low = min(float(found.returns.min()) for found in levels.values())
-        high = max(float(found.returns.max()) for found in levels.values())
+        low = min(float(summary.returns.min()) for summary in levels.values())
+        high = max(float(summary.returns.max()) for summary in levels.values())
         edges = np.linspace(low, high, BINS + 1)
-        for place, found in enumerate(levels.values()):
-            counts, _ = np.histogram(found.returns, edges)
+        for bottom, summary in enumerate(levels.values()):
+            counts, _ = np.histogram(summary.returns, edges)
             # a square root, so that the few odd episodes are seen beside the many usual ones
-            right.stairs(place + 0.85 * np.sqrt(counts / counts.max()), edges, baseline=place, fill=True, color=BLUE)
-            right.plot([found.returns.mean()] * 2, [place, place + 0.85], color=RED, linewidth=1.2)
+            right.stairs(bottom + 0.85 * np.sqrt(counts / counts.max()), edges, baseline=bottom, fill=True, color=BLUE)
+            right.plot([summary.returns.mean()] * 2, [bottom, bottom + 0.85], color=RED, linewidth=1.2)
         right.set_yticks(np.arange(len(levels)) + 0.3, list(levels))
         right.set(xlabel="return", title="episodes by return (root scale; line: mean)")
         save(fig, path)

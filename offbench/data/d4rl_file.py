@@ -52,9 +52,9 @@ def read_source(path: Path, file: h5py.File) -> Source:
     """Return an opened file's columns, checked. Raises OffbenchError if it is no D4RL file, or no honest one."""
     columns = {}
     for name in (*COLUMNS, *OPTIONAL):
-        found = _own(path, file, name)
-        if found is not None:
-            columns[name] = found
+        column = _own(path, file, name)
+        if column is not None:
+            columns[name] = column
         elif name in COLUMNS:
             raise OffbenchError(f"{path} is no D4RL file: it has no {name}")
     _check(path, columns)
@@ -66,17 +66,17 @@ def _own(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
 
     Every link is looked at before it is followed: it may lead to any file of this machine.
     """
-    found: Any = file
+    node: Any = file
     for part in name.split("/"):
-        link = found.get(part, getlink=True)
+        link = node.get(part, getlink=True)
         if link is None:
             return None
         if not isinstance(link, h5py.HardLink):
             raise OffbenchError(f"{path}: {name} is not data of this file")
-        found = found[part]
-    if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+        node = node[part]
+    if not isinstance(node, h5py.Dataset) or node.external or node.is_virtual:
         raise OffbenchError(f"{path}: {name} is not data of this file")
-    return found
+    return node
 
 
 def _check(path: Path, columns: dict[str, h5py.Dataset]) -> None:
@@ -102,19 +102,19 @@ def _about(path: Path, file: h5py.File) -> dict[str, Any]:
         return {}
     try:
         about = json.loads(text)
-        known = {key: about[key] for key in (*_STRINGS, *_LISTS, *NUMBERS, minari_store.KEY) if key in about}
-        sound = all(isinstance(known.get(key, ""), str) for key in _STRINGS)
-        sound = sound and all(all(isinstance(item, str) for item in known.get(key, [])) for key in _LISTS)
-        sound = sound and all(math.isfinite(known.get(key, 0)) for key in NUMBERS)
-        if not sound or not isinstance(known.get(minari_store.KEY, {}), dict):
+        fields = {key: about[key] for key in (*_STRINGS, *_LISTS, *NUMBERS, minari_store.KEY) if key in about}
+        sound = all(isinstance(fields.get(key, ""), str) for key in _STRINGS)
+        sound = sound and all(all(isinstance(item, str) for item in fields.get(key, [])) for key in _LISTS)
+        sound = sound and all(math.isfinite(fields.get(key, 0)) for key in NUMBERS)
+        if not sound or not isinstance(fields.get(minari_store.KEY, {}), dict):
             raise ValueError("a value of another type")
         for key in ("env_spec", "eval_env_spec"):
-            if key in known:
-                EnvSpec.from_json(without_margin(known[key])[0])
-        kept = tuple(deserialize_space(known[key]) for key in ("observation_space", "action_space") if key in known)
+            if key in fields:
+                EnvSpec.from_json(without_margin(fields[key])[0])
+        kept = tuple(deserialize_space(fields[key]) for key in ("observation_space", "action_space") if key in fields)
     except Exception as error:  # Gymnasium and Minari raise anything for JSON that is not theirs
         raise OffbenchError(f"{path}: its offbench metadata are damaged ({error}); export the dataset again") from None
-    return known | {"spaces": kept}
+    return fields | {"spaces": kept}
 
 
 _STRINGS = ("env_spec", "eval_env_spec", "observation_space", "action_space", "algorithm_name", "description")

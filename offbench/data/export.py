@@ -93,11 +93,11 @@ def _style(out: Path, style: str | None) -> str:
     """Return the format, asked for or as the file's name ends. Raises OffbenchError if the two do not fit."""
     if style not in (None, *FORMATS):
         raise OffbenchError(f"a format is one of {', '.join(FORMATS)}, not {style!r}")
-    found = next((name for name, endings in FORMATS.items() if out.suffix.lower() in endings), None)
-    if found is None or style not in (None, found):
+    by_name = next((name for name, endings in FORMATS.items() if out.suffix.lower() in endings), None)
+    if by_name is None or style not in (None, by_name):
         wanted = " or ".join(ending for name in FORMATS if style in (None, name) for ending in FORMATS[name])
         raise OffbenchError(f"cannot write {out.name!r}: {f'{style} files' if style else 'exports'} end in {wanted}")
-    return found
+    return by_name
 
 
 def _columns(data: Any, dataset_id: str, progress: Progress) -> Iterator[Columns]:

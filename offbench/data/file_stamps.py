@@ -48,8 +48,8 @@ def dataset_stamps(dataset_id: str) -> Stamps:
 
 def stamp(path: Path) -> list[int]:
     """Return what changes with a file's content. Its times can be set, but not when it was last touched (ctime)."""
-    found = path.stat()
-    return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
+    status = path.stat()
+    return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
 
 
 def recorded(path: Path) -> tuple[str, list[int]]:
@@ -68,10 +68,10 @@ def checked(paths: Mapping[str, Path], written: Mapping[str, Any]) -> dict[str, 
     """
     if paths.keys() != written.keys():
         raise ValueError("other files")
-    found = dict(written)
+    current = dict(written)
     for name, path in paths.items():
         if stamp(path) != written[name][1]:
-            found[name] = list(recorded(path))
-            if found[name][0] != written[name][0]:
+            current[name] = list(recorded(path))
+            if current[name][0] != written[name][0]:
                 raise ValueError(f"{path} is not what was written")
-    return found
+    return current

@@ -61,8 +61,8 @@ def import_d4rl(file: str | Path, dataset_id: str, *, env: str | None = None, ov
         The id.
 
     Raises:
-        OffbenchError: not such a file, damaged, NaN, without a whole transition, or without timeouts where no time
-            limit is known; an environment that does not fit or cannot be guessed.
+        OffbenchError: not such a file, damaged, NaN, without a whole transition, or without timeouts where the
+            time limit is unknown; an environment that does not fit or cannot be guessed.
     """
     path = Path(file)
     minari_store.check_id(dataset_id)
@@ -81,9 +81,9 @@ def import_d4rl(file: str | Path, dataset_id: str, *, env: str | None = None, ov
                 minari_store.claimed(dataset_id, overwrite) as folder,
                 Progress(len(source), f"importing {path}") as bar,
             ):
-                known = metadata[minari_store.KEY].get("content_sha256")
+                content = metadata[minari_store.KEY].get("content_sha256")
                 episodes = _episodes(source, ends, bar)
-                minari_store.write(folder, episodes, origin.recorded, metadata, len(source), spaces, known)
+                minari_store.write(folder, episodes, origin.recorded, metadata, len(source), spaces, content)
     except FileNotFoundError as error:
         raise OffbenchError(f"{error.filename or path} is gone; run the command again") from None
     return dataset_id
@@ -128,10 +128,10 @@ def _origin(source: Source, env: str | None) -> _Origin:
     if exported or "env_spec" in about:
         return _Origin(about.get("env_spec"), about.get("eval_env_spec"))
     word, _, rest = path.stem.lower().replace("-", "_").partition("_")
-    found = [name for name in names() if word and name.replace("-", "_").startswith(word)]
-    if len(found) != 1 or not rest.startswith(LEVEL_WORDS):
+    matches = [name for name in names() if word and name.replace("-", "_").startswith(word)]
+    if len(matches) != 1 or not rest.startswith(LEVEL_WORDS):
         raise OffbenchError(f"cannot tell the environment of {path.name}; give it, e.g. --env hopper")
-    return _by_name(source, load_recipe(found[0]))
+    return _by_name(source, load_recipe(matches[0]))
 
 
 def _by_name(source: Source, recipe: Recipe) -> _Origin:
@@ -213,8 +213,8 @@ def _ends(source: Source, origin: _Origin) -> dict[int, tuple[bool, bool]]:
             "observations of the next row, so each is the end of an episode (rounded numbers, or shuffled rows?)",
             file=sys.stderr,
         )
-    found = np.flatnonzero(stops | timeouts)
-    return {int(i): (bool(terminals[i]), bool(timeouts[i] or not terminals[i])) for i in found}
+    last_rows = np.flatnonzero(stops | timeouts)
+    return {int(i): (bool(terminals[i]), bool(timeouts[i] or not terminals[i])) for i in last_rows}
 
 
 def _broken(source: Source) -> Array:
@@ -238,14 +238,14 @@ def _starts(source: Source, origin: _Origin) -> Array:
     have 999 rows of each: cut at the limit alone, each would hold a transition from one episode into the next. First
     observations lie where the environment's resets lie.
     """
-    found = np.zeros(len(source) + 1, bool)
+    starts = np.zeros(len(source) + 1, bool)
     if origin.evaluated is None:
         print(
             f"offbench: warning: {source.path} has no timeouts, and without its environment an episode that begins "
             "before the time limit of the last one cannot be told: each is one false transition",
             file=sys.stderr,
         )
-        return found
+        return starts
     env = make_env(origin.evaluated)
     first_ones = np.array([env.reset(seed=seed)[0] for seed in range(RESETS)], np.float64)
     env.close()
@@ -254,9 +254,9 @@ def _starts(source: Source, origin: _Origin) -> Array:
     for first in range(0, len(source), BLOCK):
         off = np.abs(source.read("observations", first, min(len(source), first + BLOCK)) - middle)
         away = np.concatenate([was_away, (off > BEYOND * spread + slack).any(1)])
-        found[first : first + len(off)] = away[:-1] & (off <= WITHIN * spread + slack).all(1)
+        starts[first : first + len(off)] = away[:-1] & (off <= WITHIN * spread + slack).all(1)
         was_away = away[-1:]
-    return found
+    return starts
 
 
 def _episodes(source: Source, ends: dict[int, tuple[bool, bool]], progress: Progress) -> Iterator[Episode]:
@@ -307,8 +307,8 @@ def _metadata(
 ) -> tuple[dict[str, Any], tuple[gym.Space[Any], gym.Space[Any]]]:
     """Return Minari's metadata and the spaces."""
     about, complete = source.about, "next_observations" in source.columns
-    known = {key: about[key] for key in (*NUMBERS, "requirements") if key in about}
-    known |= {key: set(about[key]) for key in ("author", "author_email") if key in about}
+    fields = {key: about[key] for key in (*NUMBERS, "requirements") if key in about}
+    fields |= {key: set(about[key]) for key in ("author", "author_email") if key in about}
     constants = d4rl_reference(origin.recorded)
     ours: dict[str, Any] = {
         "format": "offbench-import-1",
@@ -323,7 +323,7 @@ def _metadata(
         "offbench": versions()["offbench"],
     }
     where = f", recorded in {json.loads(origin.recorded)['id']}" if origin.recorded else ""
-    metadata: dict[str, Any] = known | {
+    metadata: dict[str, Any] = fields | {
         "dataset_id": dataset_id,
         "minari_version": versions()["minari"],
         "algorithm_name": about.get("algorithm_name", "unknown"),

@@ -58,8 +58,8 @@ def episodes_of(data: Any, indices: Iterable[int] | None = None) -> Iterator[Rec
     """
     wanted = [int(i) for i in (data.episode_indices if indices is None else indices)]
     with reading(str(data.storage.metadata.get("dataset_id"))):
-        known = data.storage.get_episode_metadata(wanted)
-        for episode, about in zip(data.iterate_episodes(wanted), known, strict=True):
+        metadata = data.storage.get_episode_metadata(wanted)
+        for episode, about in zip(data.iterate_episodes(wanted), metadata, strict=True):
             # an episode that was reset with options cannot be reset from its seed alone
             seed = None if about.get("options") else about.get("seed")
             flags = episode.terminations, episode.truncations
@@ -94,12 +94,12 @@ def _elsewhere(file: h5py.File) -> str | None:
         for name in group:
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                 return f"{group.name}/{name}".replace("//", "/")
-            found = group[name]
-            if isinstance(found, h5py.Dataset) and (found.external or found.is_virtual):
-                return str(found.name)
-            if isinstance(found, h5py.Group) and found.id not in seen:  # hard links can make a circle
-                seen.add(found.id)
-                groups.append(found)
+            member = group[name]
+            if isinstance(member, h5py.Dataset) and (member.external or member.is_virtual):
+                return str(member.name)
+            if isinstance(member, h5py.Group) and member.id not in seen:  # hard links can make a circle
+                seen.add(member.id)
+                groups.append(member)
     return None
 
 

@@ -63,8 +63,8 @@ def local_ids() -> list[str]:
     base = root()
     if not base.is_dir():
         return []
-    found = (path.parent.parent.relative_to(base) for path in base.glob("**/data/metadata.json"))
-    return sorted(str(path) for path in found if not any(part.startswith(".") for part in path.parts))
+    folders = (path.parent.parent.relative_to(base) for path in base.glob("**/data/metadata.json"))
+    return sorted(str(path) for path in folders if not any(part.startswith(".") for part in path.parts))
 
 
 def recorded_by(dataset_id: str) -> tuple[str, str]:
@@ -108,7 +108,7 @@ def _absent(dataset_id: str) -> OffbenchError:
 
 def _not_downloaded(dataset_id: str) -> OffbenchError:
     """Return the error for an id with a namespace, as Minari's server has them (`mujoco/hopper/medium-v0`)."""
-    near = nearest(dataset_id, (known for known in local_ids() if "/" in known))
+    near = nearest(dataset_id, (name for name in local_ids() if "/" in name))
     hint = f"did you mean {near!r}? Or download it" if near else "download it"
     return OffbenchError(f"no local dataset {dataset_id!r}: {hint} with `minari download {dataset_id}`")
 
@@ -224,8 +224,8 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
         with disk_errors(str(path)):
             _recover(path)
         if path.exists() and not overwrite:
-            known = f"{dataset_id} exists already{_size(dataset_id)}"
-            raise OffbenchError(f"{known}; use --overwrite to replace it, or --id for another id")
+            message = f"{dataset_id} exists already{_size(dataset_id)}"
+            raise OffbenchError(f"{message}; use --overwrite to replace it, or --id for another id")
         yield path
 
 
@@ -265,7 +265,7 @@ def write(
         metadata: Minari's fields; the content hash joins those under the key `offbench`.
         steps: transitions to come, to see beforehand whether the disk has room.
         spaces: of observations and actions, where the environment is not to be asked (it may be no longer there).
-        expected: the content hash to come, where it is known; any other content is refused.
+        expected: the content hash that the data must have (None: any).
     """
     env_spec = EnvSpec.from_json(without_margin(spec)[0]) if spec else None
     aside = _partial(path)

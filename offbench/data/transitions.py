@@ -133,20 +133,20 @@ def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     action_space = action_box(data.action_space, f"{dataset_id}: actions")
     folder = cache() / _key(dataset_id, metadata, stamps)
     sources = {f"data/{name}": minari_store.path_of(dataset_id) / "data" / name for name in stamps}
-    found = _mapped(folder, sources)
-    if found is None:
+    cached = _mapped(folder, sources)
+    if cached is None:
         with disk_errors(str(folder)):
             folder.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(folder.with_name(f"{folder.name}.lock")):
-                found = _mapped(folder, sources)  # another process may have converted it meanwhile
-                if found is None:
+                cached = _mapped(folder, sources)  # another process may have converted it meanwhile
+                if cached is None:
                     with unchanged(dataset_id):
                         aside = _convert(data, dataset_id, observation_space, action_space, folder, sources)
                     aside.replace(folder)
-                    found = _mapped(folder, sources)
-    if found is None:
+                    cached = _mapped(folder, sources)
+    if cached is None:
         raise OffbenchError(f"cannot read back {folder}; delete it and try again")
-    content, arrays = found[0], dict[str, Any](found[1])
+    content, arrays = cached[0], dict[str, Any](cached[1])
     if minari_store.provenance(metadata).get("content_sha256", content) != content:
         raise OffbenchError(
             f"{dataset_id} is damaged: its arrays are not those of the content_sha256 in its metadata; "
@@ -283,9 +283,9 @@ def _episode_arrays(
         "terminations": (steps,),
     }
     for name, shape in shapes.items():
-        found = np.shape(getattr(episode, name))
-        if found != shape or not steps:
-            raise OffbenchError(f"{where}: {name} have shape {found}, expected {shape}; the dataset is damaged")
+        actual = np.shape(getattr(episode, name))
+        if actual != shape or not steps:
+            raise OffbenchError(f"{where}: {name} have shape {actual}, expected {shape}; the dataset is damaged")
     flat = {name: _float32(np.asarray(getattr(episode, name)), f"{where}: {name}") for name in NUMBERS}
     flat["masks"] = 1.0 - np.asarray(episode.terminations, np.float32)
     return flat

@@ -25,7 +25,7 @@ def dataset_table(results: Results) -> Table:
     """Return the datasets that the runs were trained on, as their config.json names them."""
     rows = []
     for task in results.tasks:
-        runs = [trained for (found, _), entry in results.entries.items() if found == task for trained in entry.runs]
+        runs = [trained for (key, _), entry in results.entries.items() if key == task for trained in entry.runs]
         envs = sorted({trained.config.env_id for trained in runs} - {""})
         rows.append(
             [
@@ -69,8 +69,8 @@ def _sizes(task: Task) -> list[Cell]:
 
 def cards(results: Results) -> list[Markup]:
     """Return the shipped cards of the environments that occur."""
-    found = (_card(env) for env in dict.fromkeys(task.place[0] for task in results.tasks))
-    return [card for card in found if card]
+    markups = (_card(env) for env in dict.fromkeys(task.env_and_level[0] for task in results.tasks))
+    return [card for card in markups if card]
 
 
 def _card(env: str) -> Markup | None:
@@ -81,10 +81,10 @@ def _card(env: str) -> Markup | None:
     card, picture = Path(str(folder / "card.json")), Path(str(folder / "card.png"))
     if not card.exists():
         return None
-    known = read_json(card)
-    rows = [[Cell(level), *map(_fact, _facts(values))] for level, values in known["levels"].items()]
+    facts = read_json(card)
+    rows = [[Cell(level), *map(_fact, _facts(values))] for level, values in facts["levels"].items()]
     header = ["level", "transitions", "episodes", "mean return", "std", "score", "terminated", "content"]
-    made = ", ".join(f"{name} {version}" for name, version in known["versions"].items())
+    made = ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
     shown = Table(f"card-{env}", f"{env} ({made})", header, rows)
     parts = [table(shown, caption=True, download=False)]
     if picture.exists():
@@ -106,5 +106,5 @@ def _facts(values: Mapping[str, Any]) -> list[tuple[str, float | None]]:
     ]
 
 
-def _fact(found: tuple[str, float | None]) -> Cell:
-    return Cell(*found)
+def _fact(fact: tuple[str, float | None]) -> Cell:
+    return Cell(*fact)

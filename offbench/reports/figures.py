@@ -101,34 +101,34 @@ def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
     return _draw(name, "A dot a seed, a bar for the mean.", f"Final scores on {task.name}. Means: {means}.", paint)
 
 
-def iqm_figure(found: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[Method, Line]) -> Figure:
+def iqm_figure(iqms: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[Method, Line]) -> Figure:
     """Draw every method's IQM with its interval."""
 
     def paint(axes: Any) -> None:
-        for row, (method, (estimate, _)) in enumerate(found.items()):
+        for row, (method, (estimate, _)) in enumerate(iqms.items()):
             color = looks[method].color
             if estimate.low is not None:
                 axes.plot([estimate.low, estimate.high], [row, row], color=color, linewidth=7, alpha=0.35)
             axes.plot([estimate.value] * 2, [row - 0.3, row + 0.3], color=color, linewidth=2.5)
-        _named_rows(axes, [looks[method].label for method in found])
+        _named_rows(axes, [looks[method].label for method in iqms])
         axes.set(xlabel="IQM of normalized scores")
 
-    text = ", ".join(f"{method.label} {estimate}" for method, (estimate, _) in found.items())
+    text = ", ".join(f"{method.label} {estimate}" for method, (estimate, _) in iqms.items())
     caption = "Interquartile mean over all tasks and its 95% stratified bootstrap interval."
     return _draw("iqm", caption, f"Interquartile means with 95% intervals: {text}.", paint)
 
 
-def profile_figure(found: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[Method, Line]) -> Figure:
+def profile_figure(iqms: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[Method, Line]) -> Figure:
     """Draw the performance profiles: the fraction of runs above each score."""
-    every = [value for _, scores in found.values() for values in scores.values() for value in values]
+    every = [value for _, scores in iqms.values() for values in scores.values() for value in values]
     taus = np.linspace(min(0.0, min(every)), max(100.0, max(every)), PROFILE_POINTS)
 
     def paint(axes: Any) -> None:
-        for method, (_, scores) in found.items():
+        for method, (_, scores) in iqms.items():
             _band(axes, taus.tolist(), profile(scores, taus.tolist()), looks[method])
         axes.set(xlabel="normalized score τ", ylabel="fraction of runs above τ", ylim=(-0.02, 1.02))
 
-    halves = {m.label: profile(s, [50.0])[0].value for m, (_, s) in found.items()}
+    halves = {m.label: profile(s, [50.0])[0].value for m, (_, s) in iqms.items()}
     text = ", ".join(f"{label} {100 * half:.0f}%" for label, half in halves.items())
     caption = "Fraction of all runs that score above τ, 95% stratified bootstrap interval shaded. Higher is better."
     return _draw("profiles", caption, f"Performance profiles. Runs above 50: {text}.", paint, list(looks.values()))
@@ -144,7 +144,7 @@ def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure |
     whole: dict[Method, tuple[list[int], dict[str, Any]]] = {}
     for method in results.methods:
         curves = {e.task.name: e.common_curve() for e in results.of(method) if e.task.reference}
-        steps = sorted(set.intersection(*(set(found[0]) for found in curves.values()))) if curves else []
+        steps = sorted(set.intersection(*(set(curve[0]) for curve in curves.values()))) if curves else []
         if steps and curves.keys() == tasks:
             whole[method] = steps[:: max(1, len(steps) // 40)], curves
     if not whole:
@@ -166,15 +166,15 @@ def loss_figure(
 ) -> Figure | None:
     """Draw a column of losses.csv over training: mean over seeds, their range shaded; None if no run has it."""
     task, ends, shown = entries[0].task, [], []
-    found = {entry.method: series for entry in entries if (series := _column(entry, column))}
-    if not found:
+    series = {entry.method: one for entry in entries if (one := _column(entry, column))}
+    if not series:
         return None
-    for method, (steps, values) in found.items():
+    for method, (steps, values) in series.items():
         ends.append(f"{method.label} {values.mean(0)[-1]:.3g} at {steps[-1]:,}")
         shown.append(looks[method])
 
     def paint(axes: Any) -> None:
-        for method, (steps, values) in found.items():
+        for method, (steps, values) in series.items():
             mean, low, high = values.mean(0), values.min(0), values.max(0)
             points = [Estimate(*map(float, row)) for row in zip(mean, low, high, strict=True)]
             _band(axes, steps, points, looks[method])
@@ -191,11 +191,11 @@ def _column(entry: Entry, column: str) -> tuple[list[int], np.ndarray[Any, Any]]
     series = [
         {int(row["step"]): row[column] for row in t.run.losses() if {"step", column} <= row.keys()} for t in entry.runs
     ]
-    steps = sorted(set.intersection(*(set(found) for found in series)))
+    steps = sorted(set.intersection(*(set(run) for run in series)))
     steps = steps[:: max(1, len(steps) // 200)]
     if not steps:
         return None
-    return steps, np.array([[found[step] for step in steps] for found in series])
+    return steps, np.array([[run[step] for step in steps] for run in series])
 
 
 def _band(axes: Any, x: Sequence[float], points: Sequence[Estimate], look: Line) -> None:

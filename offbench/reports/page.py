@@ -61,20 +61,19 @@ def _section(section: Section) -> Markup:
     return tag("section", tag("h2", section.title), *words, *section.content, "\n", id=section.name)
 
 
-def table(found: Table, *, caption: bool = False, download: bool = True) -> Markup:
+def table(data: Table, *, caption: bool = False, download: bool = True) -> Markup:
     """Return a table that sorts by a click on a column's header, with its title shown and links to its files."""
-    small = found.small or [""] * len(found.header)
+    small = data.small or [""] * len(data.header)
     head = []
-    for i, (text, below) in enumerate(zip(found.header, small, strict=True)):
+    for i, (text, below) in enumerate(zip(data.header, small, strict=True)):
         more = [tag("small", breakable(below))] if below else []
         head.append(
-            tag("th", tag("button", breakable(text), type="button"), *more, scope="col", class_=_kind(found, i))
+            tag("th", tag("button", breakable(text), type="button"), *more, scope="col", class_=_kind(data, i))
         )
-    rows = [tag("tr", *[_cell(found, i, cell) for i, cell in enumerate(row)]) for row in found.rows]
-    title = tag("caption", found.title, class_=None if caption else "unseen")
+    rows = [tag("tr", *[_cell(data, i, cell) for i, cell in enumerate(row)]) for row in data.rows]
+    title = tag("caption", data.title, class_=None if caption else "unseen")
     files = [
-        tag("a", ending.upper(), href=f"tables/{found.name}.{ending}", download=True)
-        for ending in ("csv", "md", "tex")
+        tag("a", ending.upper(), href=f"tables/{data.name}.{ending}", download=True) for ending in ("csv", "md", "tex")
     ]
     return join(
         tag(
@@ -83,18 +82,18 @@ def table(found: Table, *, caption: bool = False, download: bool = True) -> Mark
             class_="wide",
             tabindex=0,
             role="region",
-            aria_label=found.title,
+            aria_label=data.title,
         ),
-        *[tag("p", prose(note), class_="note") for note in found.notes],
+        *[tag("p", prose(note), class_="note") for note in data.notes],
         *([tag("p", "This table: ", *files, class_="files")] if download else []),
     )
 
 
-def _kind(found: Table, column: int) -> str:
-    return "name" if column < found.heads else "number"
+def _kind(data: Table, column: int) -> str:
+    return "name" if column < data.heads else "number"
 
 
-def _cell(found: Table, column: int, cell: Cell) -> Markup:
+def _cell(data: Table, column: int, cell: Cell) -> Markup:
     text: Markup = breakable(cell.text)
     if cell.best:
         text = tag("b", text)
@@ -103,16 +102,16 @@ def _cell(found: Table, column: int, cell: Cell) -> Markup:
     for small in filter(None, (cell.more, cell.below)):
         text = join(text, tag("small", breakable(small)))
     value = None if cell.value is None else repr(float(cell.value))
-    if column < found.heads:
+    if column < data.heads:
         return tag("th", text, scope="row", class_="name", data_value=value)
     return tag("td", text, class_="number best" if cell.best else "number", data_value=value)
 
 
-def figures(found: Sequence[Figure]) -> Markup:
+def figures(group: Sequence[Figure]) -> Markup:
     """Return figures in a grid below one legend of all their lines."""
-    looks = dict.fromkeys(look for figure in found for look in figure.lines)
+    looks = dict.fromkeys(look for figure in group for look in figure.lines)
     parts = []
-    for figure in found:
+    for figure in group:
         files = [
             tag("a", ending.upper(), href=f"figures/{figure.name}.{ending}", download=True)
             for ending in ("png", "svg")
@@ -131,13 +130,13 @@ def _key(look: Line) -> Markup:
 
 def boxes(results: Results) -> list[Markup]:
     """Return a box for every cell of the score table: where its number comes from."""
-    found = []
+    markup = []
     for i, task in enumerate(results.tasks):
         for j, method in enumerate(results.methods):
             entry = results.entries.get((task, method))
             if entry is not None:
-                found.append(_box(results, entry, cell_id(i, j)))
-    return found
+                markup.append(_box(results, entry, cell_id(i, j)))
+    return markup
 
 
 def _box(results: Results, entry: Entry, name: str) -> Markup:
@@ -196,8 +195,8 @@ def relative(results: Results, run: Run) -> str:
     return (inside if len(results.roots) == 1 else root.name / inside).as_posix()
 
 
-def _words(found: object) -> str:
-    return ", ".join(f"{key} {value}" for key, value in found.items()) if isinstance(found, Mapping) else "unknown"
+def _words(values: object) -> str:
+    return ", ".join(f"{key} {value}" for key, value in values.items()) if isinstance(values, Mapping) else "unknown"
 
 
 def _hardware(session: Session) -> str:

@@ -32,7 +32,7 @@ from offbench.reports.tables import is_papers_grid, scale
 
 PAGE = "index.html"
 TITLE = "Offline RL benchmark"
-GENERATOR = '<meta name="generator" content="offbench">'  # by which an older report is known
+GENERATOR = '<meta name="generator" content="offbench">'  # identifies an older report, which may be replaced
 STATES = {"unfinished": ("is unfinished", "are unfinished"), "diverged": ("diverged", "diverged")}
 
 
@@ -64,15 +64,15 @@ def report(
         raise OffbenchError(f"a report is a folder with an {PAGE} in it: give --out {folder.with_suffix('')}")
     results = read_results(runs, datasets=datasets or (), methods=methods or ())
     before = _older(folder)
-    found, pictures = _tables(results), _figures(results)
-    written = {f"tables/{one.name}.{end}": data for one in found.values() for end, data in files(one).items()}
+    by_name, pictures = _tables(results), _figures(results)
+    written = {f"tables/{one.name}.{end}": data for one in by_name.values() for end, data in files(one).items()}
     for figure in (figure for group in pictures.values() for figure in group):
         written |= {f"figures/{figure.name}.png": figure.png, f"figures/{figure.name}.svg": figure.svg}
     for name, data in written.items():
         write_bytes(folder / name, data)
     for path in before - {folder / name for name in written}:
         path.unlink(missing_ok=True)
-    content = page(title or TITLE, _lead(results), list(_sections(results, found, pictures)), boxes(results))
+    content = page(title or TITLE, _lead(results), list(_sections(results, by_name, pictures)), boxes(results))
     write_bytes(folder / PAGE, content)  # last: a page's links all lead somewhere
     return folder / PAGE
 
@@ -94,19 +94,19 @@ def _older(folder: Path) -> set[Path]:
 
 
 def _tables(results: Results) -> dict[str, Table]:
-    known = [tables.score_table(results), tables.seed_table(results), dataset_table(results)]
+    all_tables = [tables.score_table(results), tables.seed_table(results), dataset_table(results)]
     if best := best_table(results):
-        known.append(best)
-    known += similarity_tables(results)
+        all_tables.append(best)
+    all_tables += similarity_tables(results)
     beside = tables.beside_table(results)
     aggregates = tables.iqms(results)
     if beside:
-        known.append(beside)
+        all_tables.append(beside)
     if aggregates:
-        known.append(tables.iqm_table(results, aggregates))
+        all_tables.append(tables.iqm_table(results, aggregates))
     if len(aggregates) > 1:
-        known.append(tables.improvement_table(results, aggregates))
-    return {one.name: one for one in known}
+        all_tables.append(tables.improvement_table(results, aggregates))
+    return {one.name: one for one in all_tables}
 
 
 def _figures(results: Results) -> dict[str, list[Figure]]:
@@ -167,25 +167,25 @@ def _lead(results: Results) -> Markup:
 
 
 def _sections(
-    results: Results, found: Mapping[str, Table], pictures: Mapping[str, Sequence[Figure]]
+    results: Results, by_name: Mapping[str, Table], pictures: Mapping[str, Sequence[Figure]]
 ) -> Iterator[Section]:
     words = "Click a number to see where it comes from: seeds, commands, versions, hardware. Click a header to sort."
-    yield Section("scores", found["scores"].title, [table(found["scores"])], words)
-    if "best" in found:
-        yield Section("best", found["best"].title, [table(found["best"])])
-    if "iqm" in found:
-        parts = [figures(pictures["iqm"]), table(found["iqm"])]
+    yield Section("scores", by_name["scores"].title, [table(by_name["scores"])], words)
+    if "best" in by_name:
+        yield Section("best", by_name["best"].title, [table(by_name["best"])])
+    if "iqm" in by_name:
+        parts = [figures(pictures["iqm"]), table(by_name["iqm"])]
         yield Section("aggregate", "Across datasets", parts)
-    if "improvement" in found:
-        yield Section("improvement", "Probability of improvement", [table(found["improvement"])])
+    if "improvement" in by_name:
+        yield Section("improvement", "Probability of improvement", [table(by_name["improvement"])])
     words = "The BDB paper's Figure 4 shows the same for its datasets." if is_papers_grid(results) else ""
     yield Section("curves", "Learning curves", [figures(pictures["curves"])], words)
     yield Section("finals", "Final scores, seed by seed", [figures(pictures["finals"])])
-    if "beside" in found:
-        yield Section("beside", "Beside published numbers", [table(found["beside"])])
-    if "similarity" in found:
-        more = tag("details", tag("summary", "Both readings"), table(found["similarity-details"]))
-        yield Section("similarity", found["similarity"].title, [table(found["similarity"]), more])
+    if "beside" in by_name:
+        yield Section("beside", "Beside published numbers", [table(by_name["beside"])])
+    if "similarity" in by_name:
+        more = tag("details", tag("summary", "Both readings"), table(by_name["similarity-details"]))
+        yield Section("similarity", by_name["similarity"].title, [table(by_name["similarity"]), more])
     if pictures["beta"]:
         words = "BDB's weight of the discriminator against cloning: 0 is TD3+BC, 1 the discriminator alone."
         yield Section("beta", "Beta over training", [figures(pictures["beta"])], words)
@@ -194,9 +194,9 @@ def _sections(
             "Mean |Q1| on the dataset's own actions. A critic that diverges is seen here before the score shows it."
         )
         yield Section("critic", "Critic over training", [figures(pictures["q"])], words)
-    yield Section("datasets", "Datasets", [table(found["datasets"]), *_shipped(results)])
-    summary = f"Show {counted(len(found['seeds'].rows), 'run')}"
-    every = tag("details", tag("summary", summary), table(found["seeds"]))
+    yield Section("datasets", "Datasets", [table(by_name["datasets"]), *_shipped(results)])
+    summary = f"Show {counted(len(by_name['seeds'].rows), 'run')}"
+    every = tag("details", tag("summary", summary), table(by_name["seeds"]))
     yield Section("runs", "Every run", [every, _waiting(results)])
 
 

@@ -15,17 +15,17 @@ from offbench.reports.tables import NONE, is_papers_grid, plus_minus, published,
 def similarity_tables(results: Results) -> list[Table]:
     """Return the similar scores and their details, from the runs' similarity.json; [] if there is none."""
     paper = {(r["env"], r["level"], r["method"]): r["similar_score_percent"] for r in published("similarity")}
-    found = {key: values for key, entry in results.entries.items() if (values := _similar(entry))}
-    methods = [method for method in results.methods if any(key[1] == method for key in found)]
+    similar = {key: values for key, entry in results.entries.items() if (values := _similar(entry))}
+    methods = [method for method in results.methods if any(key[1] == method for key in similar)]
     rows, details = [], []
     for task in results.tasks:
-        env, level = task.place
+        env, level = task.env_and_level
         cells = []
         for method in methods:
-            if (task, method) not in found:
+            if (task, method) not in similar:
                 cells.append(NONE)
                 continue
-            values = found[task, method]
+            values = similar[task, method]
             by_q, by_action = (mean_std([getattr(v, key) for v in values]) for key in ("q_similar", "action_similar"))
             number = paper.get((env, level, _similar_name(method)))
             cells.append(Cell(plus_minus(by_q), by_q[0], f"paper {number}" if number else ""))

@@ -7,7 +7,7 @@ import dataclasses
 import importlib.resources
 from collections.abc import Mapping, Sequence
 
-from offbench.analysis.compare import comparable, differences, favoured, partners
+from offbench.analysis.compare import comparable, differences, favored, partners
 from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import REFERENCES, Entry, Results, Task, window_words
 from offbench.analysis.statistics import Estimate, Scores, improvement, iqm, paired
@@ -38,12 +38,12 @@ def is_papers_grid(results: Results) -> bool:
     rows = [row for row in published("scores") if row["source"] == PAPER]
     methods = {method.published for method in results.methods}
     places = {(row["env"], row["level"]) for row in rows}
-    return methods >= PAPER_METHODS and all(task.place in places for task in results.tasks)
+    return methods >= PAPER_METHODS and all(task.env_and_level in places for task in results.tasks)
 
 
-def plus_minus(found: tuple[float, float | None], digits: int = 1) -> str:
+def plus_minus(mean_and_std: tuple[float, float | None], digits: int = 1) -> str:
     """Return `mean ± std`; one seed has no spread, and the text says so."""
-    mean, std = found
+    mean, std = mean_and_std
     return f"{mean:.{digits}f} ± " + ("?" if std is None else f"{std:.{digits}f}")
 
 
@@ -58,7 +58,7 @@ def score_table(results: Results) -> Table:
     seeds = {len(entry.runs) for entry in results.entries.values()}
     rows = []
     for i, task in enumerate(results.tasks):
-        env, level = task.place
+        env, level = task.env_and_level
         cells, ranked = [], results.comparable(task)
         for j, method in enumerate(results.methods):
             entry = results.entries.get((task, method))
@@ -87,8 +87,8 @@ def score_table(results: Results) -> Table:
 
 def row_name(results: Results, task: Task, more: str = "") -> list[Cell]:
     """Return level and environment as a row's name, with what tells it apart where another dataset has the same."""
-    env, level = task.place
-    namesakes = {other.dataset for other in results.tasks if other.place == task.place}
+    env, level = task.env_and_level
+    namesakes = {other.dataset for other in results.tasks if other.env_and_level == task.env_and_level}
     apart = task.name if len(namesakes) > 1 else task.content[:DIGITS] if task.twin else ""
     below = [task.dataset if apart != task.name else "", more]
     return [Cell(level or "-"), Cell(env, below=" · ".join(filter(None, below)), more=apart)]
@@ -109,17 +109,17 @@ def column_steps(entries: Sequence[Entry]) -> str:
 
 
 def _score_cell(entry: Entry, below: str, detail: str, more: str) -> Cell:
-    found = mean_std(entry.scores)
+    score = mean_std(entry.scores)
     marks = [mark for state, mark in (("unfinished", " †"), ("diverged", " ‡")) if state in entry.states]
     marks += [] if entry.of_one_code else [" §"]
-    text = plus_minus(found) + "".join(marks)
-    return Cell(text if entry.task.reference else f"return {text}", found[0], below, detail=detail, more=more)
+    text = plus_minus(score) + "".join(marks)
+    return Cell(text if entry.task.reference else f"return {text}", score[0], below, detail=detail, more=more)
 
 
 def _best(cells: Sequence[Cell]) -> list[Cell]:
     """Return the cells with the highest mean marked, and those that print the same mean."""
-    known = [cell.value for cell in cells if cell.value is not None]
-    top = f"{max(known):.1f}" if len(known) > 1 else None
+    means = [cell.value for cell in cells if cell.value is not None]
+    top = f"{max(means):.1f}" if len(means) > 1 else None
     same = [cell.value is not None and f"{cell.value:.1f}" == top for cell in cells]
     return [dataclasses.replace(cell, best=best) for cell, best in zip(cells, same, strict=True)]
 
@@ -170,22 +170,22 @@ def _torn(entries: Sequence[Entry]) -> list[str]:
     for entry in entries:
         for trained in entry.runs:
             if entry.task.reference == "dataset":
-                scales.setdefault(entry.task.place[0], set()).add(trained.config.references["dataset"] or ())
+                scales.setdefault(entry.task.env_and_level[0], set()).add(trained.config.references["dataset"] or ())
     return sorted(env for env, pairs in scales.items() if len(pairs) > 1)
 
 
 def scale(results: Results) -> str:
     """Return what a score of these results means, in a sentence or two."""
-    known = {task.reference for task in results.tasks}
+    references = {task.reference for task in results.tasks}
     words = {
         "dataset": "Scores are normalized by each dataset's own reference: 0 is the random policy, 100 the expert.",
         "d4rl": "Scores are normalized by D4RL's constants, measured in older environments: 0 is their random policy, "
         "100 their expert.",
         None: "Datasets without a reference have no score: their rows are raw returns.",
     }
-    if len(known) == 1:
-        return words[known.pop()]
-    return " ".join([text for key, text in words.items() if key in known]) + " Each row says which."
+    if len(references) == 1:
+        return words[references.pop()]
+    return " ".join([text for key, text in words.items() if key in references]) + " Each row says which."
 
 
 def beside_table(results: Results) -> Table | None:
@@ -194,18 +194,21 @@ def beside_table(results: Results) -> Table | None:
     for row in published("scores"):
         spread = f" ± {row['std_as_printed']}" if row["std_as_printed"] else ""
         source = (f"{row['source']}, {row['dataset_version']}", row["protocol"])
-        place = (row["env"], row["level"], row["method"])
-        numbers.setdefault(place, {})[source] = f"{float(row['normalized_score']):g}{spread}"
+        key = (row["env"], row["level"], row["method"])
+        numbers.setdefault(key, {})[source] = f"{float(row['normalized_score']):g}{spread}"
     entries = results.entries.values()
-    known = [(e, numbers[p]) for e in entries if (p := (*e.task.place, e.method.published)) in numbers]
-    sources = list(dict.fromkeys(source for _, found in known for source in found))
-    if not known:
+    pairs = [(e, numbers[p]) for e in entries if (p := (*e.task.env_and_level, e.method.published)) in numbers]
+    sources = list(dict.fromkeys(source for _, published_scores in pairs for source in published_scores))
+    if not pairs:
         return None
     rows = []
-    for entry, found in known:
+    for entry, published_scores in pairs:
         ours = [entry.mean_std(reference) for reference in ("dataset", "d4rl")]
         cells = [Cell(plus_minus(pair), pair[0]) if pair else NONE for pair in ours]
-        cells += [Cell(text, float(text.split()[0])) if (text := found.get(source)) else NONE for source in sources]
+        cells += [
+            Cell(text, float(text.split()[0])) if (text := published_scores.get(source)) else NONE
+            for source in sources
+        ]
         rows.append([*row_name(results, entry.task), Cell(entry.method.label), *cells])
     header = ["level", "environment", "method", "ours", "ours", *[source for source, _ in sources]]
     small = ["", "", "", "own reference", "D4RL's constants", *[protocol for _, protocol in sources]]
@@ -216,13 +219,13 @@ def beside_table(results: Results) -> Table | None:
 def iqms(results: Results) -> dict[Method, tuple[Estimate, Scores]]:
     """Return each method's IQM over the tasks that it has and that have a reference."""
     scores = {method: results.scores(method) for method in results.methods}
-    return {method: (iqm(found), found) for method, found in scores.items() if found}
+    return {method: (iqm(by_task), by_task) for method, by_task in scores.items() if by_task}
 
 
-def iqm_table(results: Results, found: Mapping[Method, tuple[Estimate, Scores]]) -> Table:
+def iqm_table(results: Results, iqms: Mapping[Method, tuple[Estimate, Scores]]) -> Table:
     """Return the IQM of every method with its interval."""
     rows = []
-    for method, (estimate, scores) in found.items():
+    for method, (estimate, scores) in iqms.items():
         runs = sum(len(values) for values in scores.values())
         numbers = [Cell("-" if end is None else f"{end:.1f}", end) for end in (estimate.low, estimate.high)]
         counts = [Cell(f"{count}", count) for count in (len(scores), runs)]
@@ -232,7 +235,7 @@ def iqm_table(results: Results, found: Mapping[Method, tuple[Estimate, Scores]])
         "highest quarter), and its 95% interval by stratified bootstrap: seeds are resampled within each "
         f"task (Agarwal et al. 2021). {FEW_SEEDS}",
     ]
-    if len({tuple(scores) for _, scores in found.values()}) > 1:
+    if len({tuple(scores) for _, scores in iqms.values()}) > 1:
         notes.append("The methods were not run on the same tasks: their IQMs do not compare one with another.")
     if not all(results.comparable(task) for task in results.tasks):
         notes.append(
@@ -243,18 +246,18 @@ def iqm_table(results: Results, found: Mapping[Method, tuple[Estimate, Scores]])
     return Table("iqm", "Interquartile mean over tasks", header, rows, notes)
 
 
-def improvement_table(results: Results, found: Mapping[Method, tuple[Estimate, Scores]]) -> Table:
+def improvement_table(results: Results, iqms: Mapping[Method, tuple[Estimate, Scores]]) -> Table:
     """Return the probability that a run of the row's method beats one of the column's, over their common tasks."""
-    methods = list(found)
-    known: dict[tuple[Method, Method], Estimate] = {}
+    methods = list(iqms)
+    chances: dict[tuple[Method, Method], Estimate] = {}
     for i, a in enumerate(methods):
         for b in methods[i + 1 :]:
-            if set(found[a][1]) & set(found[b][1]):
-                known[a, b] = estimate = improvement(found[a][1], found[b][1])
+            if set(iqms[a][1]) & set(iqms[b][1]):
+                chances[a, b] = estimate = improvement(iqms[a][1], iqms[b][1])
                 ends = (None if end is None else 1 - end for end in (estimate.high, estimate.low))
-                known[b, a] = Estimate(1 - estimate.value, *ends)
-    better = {pair for pair in known if _better(results, *pair)}
-    rows = [[Cell(a.label), *[_chance(known.get((a, b)), (a, b) in better) for b in methods]] for a in methods]
+                chances[b, a] = Estimate(1 - estimate.value, *ends)
+    better = {pair for pair in chances if _better(results, *pair)}
+    rows = [[Cell(a.label), *[_chance(chances.get((a, b)), (a, b) in better) for b in methods]] for a in methods]
     notes = [
         "Probability in percent that a run of the row's method scores above one of the column's, averaged over the "
         f"tasks that both have, with its 95% interval by stratified bootstrap. 50 is a draw. {FEW_SEEDS} An interval "
@@ -271,7 +274,7 @@ def _better(results: Results, a: Method, b: Method) -> bool:
     """Return whether `compare` finds A better, on the tasks that have scores."""
     groups = ([entry for entry in results.of(method) if entry.task.reference] for method in (a, b))
     both = partners(*groups)
-    return bool(both) and comparable(both) and favoured(paired(differences(both))) > 0
+    return bool(both) and comparable(both) and favored(paired(differences(both))) > 0
 
 
 def _chance(estimate: Estimate | None, better: bool) -> Cell:

@@ -87,9 +87,9 @@ def _safely(check: Callable[[], Iterator[tuple[str, str]]]) -> list[tuple[str, s
 
 
 def _versions() -> Iterator[tuple[str, str]]:
-    found = versions()
-    missing = [name for name, version in found.items() if version == "not installed"]
-    yield BROKEN if missing else OK, ", ".join(f"{name} {version}" for name, version in found.items())
+    packages = versions()
+    missing = [name for name, version in packages.items() if version == "not installed"]
+    yield BROKEN if missing else OK, ", ".join(f"{name} {version}" for name, version in packages.items())
 
 
 def _machine() -> Iterator[tuple[str, str]]:
@@ -106,8 +106,8 @@ def _gpu() -> Iterator[tuple[str, str]]:
 
         if torch.cuda.is_available():
             for i in range(torch.cuda.device_count()):
-                known = torch.cuda.get_device_properties(i)
-                yield OK, f"cuda:{i} {known.name}, {known.total_memory / 1e9:.0f} GB"
+                device = torch.cuda.get_device_properties(i)
+                yield OK, f"cuda:{i} {device.name}, {device.total_memory / 1e9:.0f} GB"
             return
     built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built for the CPU alone"
     yield NOTE, f"none seen by PyTorch, which is {built}; trainings run on the CPU"
@@ -149,16 +149,16 @@ def replay_error(count: int) -> float:
 
 def _spread(episodes: Iterator[Episode], count: int) -> Iterator[tuple[Array, Array, Array]]:
     """Yield (observation, action, next observation), one from the middle of every eighth episode."""
-    found = 0
+    yielded = 0
     for number, episode in enumerate(episodes):
         step = len(episode) // 2
         if number % 8 or np.abs(episode.observations[step, 5:]).max() >= 10:
             continue
         yield episode.observations[step], episode.actions[step], episode.observations[step + 1]
-        found += 1
-        if found == count:
+        yielded += 1
+        if yielded == count:
             return
-    raise OffbenchError(f"the shipped data hold {found} of {count} transitions")
+    raise OffbenchError(f"the shipped data hold {yielded} of {count} transitions")
 
 
 def _algorithms() -> Iterator[tuple[str, str]]:
@@ -182,7 +182,7 @@ def _cache() -> Iterator[tuple[str, str]]:
 
 def _writable(folder: Path, variable: str) -> Iterator[tuple[str, str]]:
     """Try to write where `folder` is, or will be."""
-    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    there = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     remedy = f"; set {variable} to another folder" if variable else "; go to another folder"
     try:
         with tempfile.NamedTemporaryFile(dir=there) as file:

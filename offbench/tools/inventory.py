@@ -133,8 +133,8 @@ def sections(contents: Mapping[str, Any]) -> Iterator[Section]:
         if name in contents:
             yield name, [], [[", ".join(contents[name]) + more]]
     if "datasets" in contents:
-        found = contents["datasets"].items()
-        rows = [[name, _transitions(data), f"{data['total_episodes']:,}"] for name, data in found]
+        datasets = contents["datasets"].items()
+        rows = [[name, _transitions(data), f"{data['total_episodes']:,}"] for name, data in datasets]
         none = [["none; record one with `offbench collect ENV --level LEVEL`"]]
         header = ["id", "transitions", "episodes"] if rows else []
         yield f"datasets in {minari_store.root()}", header, rows or none

@@ -50,7 +50,7 @@ FORMER_SETTINGS: dict[str, dict[str, Any]] = {
 
 @functools.cache
 def _entry_points() -> dict[str, list[importlib.metadata.EntryPoint]]:
-    found: dict[str, list[importlib.metadata.EntryPoint]] = {}
+    by_name: dict[str, list[importlib.metadata.EntryPoint]] = {}
     for package in importlib.metadata.distributions():
         try:
             points = package.entry_points.select(group=GROUP)
@@ -58,9 +58,9 @@ def _entry_points() -> dict[str, list[importlib.metadata.EntryPoint]]:
             print(f"offbench: warning: {package} has unreadable entry points ({error})", file=sys.stderr)
             continue
         for point in points:
-            if point not in (same := found.setdefault(point.name, [])):
+            if point not in (same := by_name.setdefault(point.name, [])):
                 same.append(point)
-    return found
+    return by_name
 
 
 def algorithm_names() -> list[str]:
@@ -119,14 +119,14 @@ def load_algorithm(name: str) -> type[Algorithm]:
         return _own[name]
     points = _entry_points()
     if name not in points:
-        known = json.loads(os.environ.get(OWN, "{}"))
-        if name not in known:
+        own = json.loads(os.environ.get(OWN, "{}"))
+        if name not in own:
             raise unknown("algorithm", name, points)
-        module, _, qualname = known[name].partition(":")
-        found: Any = importlib.import_module(module)
+        module, _, qualname = own[name].partition(":")
+        cls: Any = importlib.import_module(module)
         for part in qualname.split("."):
-            found = getattr(found, part)
-        return _own.setdefault(name, found)
+            cls = getattr(cls, part)
+        return _own.setdefault(name, cls)
     point, *others = points[name]
     if others:
         raise OffbenchError(f"two algorithms are named {name!r}: {point.value} and {others[0].value}; rename yours")

@@ -164,7 +164,7 @@ class Run:
         if isinstance(values, dict):
             later = values.get("sessions")
             for session in [values, *(later if isinstance(later, list) else [])]:
-                if isinstance(session, dict):  # earlier versions wrote tf32, true or false, in place of precision
+                if isinstance(session, dict):  # earlier versions wrote tf32 (true or false) instead of precision
                     session.setdefault("precision", "tf32" if session.get("tf32") else "float32")
         return read_back(RunConfig, values, self.config_path, "delete the run to repeat it")
 

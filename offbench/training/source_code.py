@@ -46,28 +46,28 @@ def code_of(algorithm: str) -> dict[str, str]:
 def _code_of(kind: type[Algorithm]) -> dict[str, str]:
     from offbench.algorithm.interface import Algorithm  # imports PyTorch, which those who read config.json do without
 
-    found: dict[str, str] = {}
+    hashes: dict[str, str] = {}
     for cls in kind.__mro__[: kind.__mro__.index(Algorithm)]:
         module = sys.modules.get(cls.__module__)
         file = Path(getattr(module, "__file__", None) or "")
         package = cls.__module__.partition(".")[0]
         if cls.__module__ == "__main__" or not file.is_file():
-            found |= {one.__qualname__: text for one in (cls, kind.Config) if (text := _source_hash(one))}
+            hashes |= {one.__qualname__: text for one in (cls, kind.Config) if (text := _source_hash(one))}
         elif package == "offbench":
-            found[file.name] = _hash(file.read_text("utf-8"))
+            hashes[file.name] = _hash(file.read_text("utf-8"))
         elif package != cls.__module__ or file.name == "__init__.py":
             root = Path(str(sys.modules[package].__file__)).parent
-            found |= {
+            hashes |= {
                 str(path.relative_to(root.parent)): _hash(path.read_text("utf-8")) for path in root.rglob("*.py")
             }
-            found |= _version(package)
+            hashes |= _version(package)
         else:
-            found |= {path.name: _hash(path.read_text("utf-8")) for path in _imported(file, {})} | _version(package)
-    return dict(sorted(found.items()))
+            hashes |= {path.name: _hash(path.read_text("utf-8")) for path in _imported(file, {})} | _version(package)
+    return dict(sorted(hashes.items()))
 
 
 def changes(before: Any, now: Mapping[str, str]) -> str:
-    """Return what differs between two `code_of`, for an error line; "" for nothing, or if either is not known."""
+    """Return what differs between two `code_of`, for an error line; "" for nothing, or if either is missing."""
     if not isinstance(before, dict) or not before or not now:
         return ""
     differ = [name for name in {**before, **now} if before.get(name) != now.get(name)]

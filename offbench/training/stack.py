@@ -1,7 +1,7 @@
 """A stack: runs that learn as one program.
 
-Program   one update of every run, fed from buffers that stay in place: it is captured once for each phase and then
-          replayed, on a GPU as a CUDA graph, on a CPU by offbench.algorithm.capture
+Program   one update of every run, fed from fixed buffers: it is captured once for each phase and then replayed,
+          on a GPU as a CUDA graph, on a CPU by offbench.algorithm.capture
 Stack     the learning state of the runs: train, log, policies, what a checkpoint keeps
 """
 
@@ -50,7 +50,7 @@ class Program:
         self._side: Any = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
 
     def load(self, indices: Tensor, noise: Mapping[str, Tensor], first: int) -> None:
-        """Put a chunk's indices and noise in place; the next update takes row `first`."""
+        """Copy a chunk's indices and noise into the buffers; the next update takes row `first`."""
         if not len(self.indices):
             self.indices, self.noise = indices, dict(noise)
         self.indices.copy_(indices)
@@ -95,7 +95,7 @@ class Program:
         if recording is not None:
             if phase in self._recordings and not recording.same_as(self._recordings[phase]):
                 reason = reason or f"is not the same at every update of phase {phase!r}"
-            if done <= RECORDED:  # a later one is only compared: its buffers are not worth a change of place
+            if done <= RECORDED:  # a later one is only compared: copying it into other buffers would gain nothing
                 self._recordings[phase] = recording
         if reason and done > RECORDED:
             name = type(self.algorithm).__name__
@@ -244,21 +244,21 @@ class Stack:
 
     def load(self, run: int, tensors: Mapping[str, Tensor]) -> None:
         """Put one run's checkpoint back. Raises OffbenchError if it does not fit."""
-        for name, place in self.run_tensors(run).items():
-            found = tensors.get(name)
-            if found is None or found.shape != place.shape:
+        for name, tensor in self.run_tensors(run).items():
+            saved = tensors.get(name)
+            if saved is None or saved.shape != tensor.shape:
                 raise OffbenchError(f"the checkpoint in {self.specs[run].folder} does not fit; delete the run")
             with torch.no_grad():
-                place.copy_(found)
+                tensor.copy_(saved)
 
     def diverged(self) -> dict[int, str]:
         """Return the runs that hold NaN or infinity, each with the name of such a tensor."""
-        found: dict[int, str] = {}
+        names: dict[int, str] = {}
         for name, tensor in self.tensors().items():
             if tensor.dim():
                 bad = (~torch.isfinite(tensor)).flatten(2).any(2).any(0).nonzero()
-                found |= {int(run): name for run in bad}
-        return found
+                names |= {int(run): name for run in bad}
+        return names
 
 
 def _check_policy(algorithm: Algorithm, observation_dim: int, action_dim: int) -> None:

@@ -92,7 +92,7 @@ class Findings:
         self._seen.setdefault(code, []).append((where, detail))
 
     def codes(self) -> set[str]:
-        """Return what was found so far."""
+        """Return the codes of the findings so far."""
         return set(self._seen)
 
     def all(self) -> tuple[Finding, ...]:
@@ -111,7 +111,7 @@ class Findings:
 
 @dataclass
 class Report:
-    """What `verify` did and found."""
+    """What `verify` checked, and its findings."""
 
     dataset_id: str
     transitions: int = 0
@@ -123,7 +123,7 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """True if nothing was found."""
+        """True if there are no findings."""
         return not self.findings
 
     def lines(self) -> list[str]:

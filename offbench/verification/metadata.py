@@ -20,13 +20,13 @@ SLACK = 0.02  # and by this share of the references' distance: rungs are chosen 
 
 
 def check_claims(
-    ours: dict[str, Any], found: Survey, limit: int | None, report: Report, findings: Findings
+    ours: dict[str, Any], survey: Survey, limit: int | None, report: Report, findings: Findings
 ) -> list[int]:
     """Check what offbench recorded about a dataset; return the last episode of each part."""
-    last = [len(found.lengths) - 1] if found.lengths else []
+    last = [len(survey.lengths) - 1] if survey.lengths else []
     if "content_sha256" in ours:
         report.checked.append("the content hash")
-        if ours["content_sha256"] != found.content.hexdigest():
+        if ours["content_sha256"] != survey.content.hexdigest():
             findings.add("content-hash", "metadata", f"recorded {str(ours['content_sha256'])[:12]}...")
     else:
         report.skipped.append("the content hash: none is recorded")
@@ -34,11 +34,11 @@ def check_claims(
         report.skipped.append("levels and returns: not recorded by offbench")
         return last
     try:
-        cuts = _cuts(ours["parts"], found, findings)
+        cuts = _cuts(ours["parts"], survey, findings)
         if cuts is not None:
             _levels(ours, findings)
             for index, (part, (first, end)) in enumerate(zip(ours["parts"], cuts, strict=True)):
-                _part(ours, part, index, range(first, end), found, limit, findings)
+                _part(ours, part, index, range(first, end), survey, limit, findings)
             last = [end - 1 for _, end in cuts]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, ZeroDivisionError, OverflowError) as error:
         findings.add("metadata", "metadata", f"{type(error).__name__}: {error}")
@@ -46,9 +46,9 @@ def check_claims(
     return last
 
 
-def _cuts(parts: Sequence[dict[str, Any]], found: Survey, findings: Findings) -> list[tuple[int, int]] | None:
+def _cuts(parts: Sequence[dict[str, Any]], survey: Survey, findings: Findings) -> list[tuple[int, int]] | None:
     """Return the episodes [first, end) of each part, or None if parts do not end where episodes do."""
-    ends = np.cumsum(found.lengths)
+    ends = np.cumsum(survey.lengths)
     wanted = np.cumsum([int(part["transitions"]) for part in parts])
     places = np.searchsorted(ends, wanted)
     if len(places) == 0 or places[-1] != len(ends) - 1 or (ends[places] != wanted).any():
@@ -66,10 +66,10 @@ def _references(ours: dict[str, Any]) -> tuple[float, float]:
 def _levels(ours: dict[str, Any], findings: Findings) -> None:
     """Check that the levels' own numbers agree with each other."""
     low, high = _references(ours)
-    known = {part["source"]: float(part["return"]) for part in ours["parts"] if "return" in part}
-    order = [known[name] for name in ("uniform", "medium", "expert") if name in known]
-    if not low < high or order != sorted(order) or known.get("medium", low) >= high:
-        findings.add("level-order", "metadata", f"random {low:g}, expert {high:g}, parts {known}")
+    returns = {part["source"]: float(part["return"]) for part in ours["parts"] if "return" in part}
+    order = [returns[name] for name in ("uniform", "medium", "expert") if name in returns]
+    if not low < high or order != sorted(order) or returns.get("medium", low) >= high:
+        findings.add("level-order", "metadata", f"random {low:g}, expert {high:g}, parts {returns}")
     if ours["level"] in LEVELS and [p.source for p in LEVELS[ours["level"]]] != [p["source"] for p in ours["parts"]]:
         findings.add("metadata", "metadata", f"level {ours['level']} is not made of these parts")
     for part in ours["parts"]:
@@ -84,18 +84,18 @@ def _part(
     part: dict[str, Any],
     index: int,
     chosen: range,
-    found: Survey,
+    survey: Survey,
     limit: int | None,
     out: Findings,
 ) -> None:
     """Check one part's seeds and mean return."""
     if part["source"] != "replay":
         for k, i in enumerate(chosen):
-            if found.seeds[i] != seeds.integer(int(ours["seed"]), Purpose.RESET, index, k):
+            if survey.seeds[i] != seeds.integer(int(ours["seed"]), Purpose.RESET, index, k):
                 out.add("wrong-seeds", f"episode {i}")
     if "return" not in part:
         return
-    whole = [found.returns[i] for i in chosen if found.ended[i][0] or limit is None or found.lengths[i] == limit]
+    whole = [survey.returns[i] for i in chosen if survey.ended[i][0] or limit is None or survey.lengths[i] == limit]
     if not whole or not np.isfinite(whole).all():
         return
     count = int(part.get("episodes") or ours["references"]["random"]["episodes"])

@@ -21,7 +21,7 @@ from offbench.rollouts.rollouts import kept_envs, number
 
 STEPS = 40  # of an episode that are replayed one by one
 WHOLE, CLOSE, ROUNDED = 1e-9, 1e-6, 1e-4  # tolerances: same physics, other version, observations kept as float32
-CLIPPED_VELOCITY = 10.0  # Hopper and Walker2d report no velocity beyond it: the state is not known there
+CLIPPED_VELOCITY = 10.0  # Hopper and Walker2d report no velocity beyond it: the state cannot be recovered there
 SHARE = 0.01  # of the replayed steps, or one of them, that rounding may carry across a contact or a limit
 
 
@@ -180,8 +180,8 @@ def _one_step(env: gym.Env[Any, Any], state: _State, e: Recorded, exact: bool, l
     tolerance = ROUNDED if rounded else WHOLE if exact else CLOSE
     last = len(e) - 1
     steps = np.unique(np.linspace(0, last, min(len(e), STEPS)).astype(int))
-    known = (np.abs(seen[:-1, state.positions : state.size]) != CLIPPED_VELOCITY).all(1)
-    steps = np.array([t for t in steps if known[t] and not (t == last and last_unknown)], int)
+    complete = (np.abs(seen[:-1, state.positions : state.size]) != CLIPPED_VELOCITY).all(1)
+    steps = np.array([t for t in steps if complete[t] and not (t == last and last_unknown)], int)
     if not len(steps):
         return Verdict(e.index, "none", 0)
     env.reset(seed=0)
@@ -207,8 +207,8 @@ def _one_step(env: gym.Env[Any, Any], state: _State, e: Recorded, exact: bool, l
 
 
 def _far(observation: Array, recorded: Array, state: _State, tolerance: float) -> bool:
-    found = np.asarray(observation, np.float64)[None, : state.size]
-    return bool(_off(found, recorded[None, : state.size], tolerance)[0])
+    actual = np.asarray(observation, np.float64)[None, : state.size]
+    return bool(_off(actual, recorded[None, : state.size], tolerance)[0])
 
 
 def _why_step(

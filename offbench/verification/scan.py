@@ -22,7 +22,7 @@ INSIDE = 1e-4  # of the span: a bound nearer to the space's than this is the spa
 
 @dataclass
 class Survey:
-    """What one pass over the episodes found."""
+    """The results of one pass over the episodes."""
 
     content: ContentHash = field(default_factory=ContentHash)
     lengths: list[int] = field(default_factory=list)
@@ -37,22 +37,22 @@ class Survey:
         return sum(self.lengths)
 
 
-def survey(data: Any, limit: int | None, findings: Findings) -> Survey:
+def scan(data: Any, limit: int | None, findings: Findings) -> Survey:
     """Look at every episode of a MinariDataset once; `limit` is the environment's time limit, if it has one."""
-    found, piles, twins = Survey(), _Piles(data.action_space), _Twins()
+    result, piles, twins = Survey(), _Piles(data.action_space), _Twins()
     with Progress(int(data.total_steps), f"verifying {data.storage.metadata.get('dataset_id')}") as progress:
         for episode in episodes_of(data):
             where = f"episode {episode.index}"
             numeric = all(array.dtype.kind in "fiub" for array in episode.arrays)
             sound = numeric and _check(episode, data.observation_space, data.action_space, limit, where, findings)
             ends = tuple(bool(flags[-1]) if flags.size else False for flags in episode.arrays[3:])
-            found.lengths.append(len(episode))
-            found.seeds.append(episode.seed)
-            found.ended.append((ends[0], ends[1]))
-            found.sound.append(sound)
-            found.returns.append(float(np.sum(episode.rewards, dtype=np.float64)) if numeric else float("nan"))
+            result.lengths.append(len(episode))
+            result.seeds.append(episode.seed)
+            result.ended.append((ends[0], ends[1]))
+            result.sound.append(sound)
+            result.returns.append(float(np.sum(episode.rewards, dtype=np.float64)) if numeric else float("nan"))
             if numeric:
-                found.content.add(episode.observations, episode.actions, episode.rewards, found.ended[-1])
+                result.content.add(episode.observations, episode.actions, episode.rewards, result.ended[-1])
                 twins.add(episode, findings)
             else:
                 findings.add("dtype", where, "not numbers")
@@ -60,8 +60,8 @@ def survey(data: Any, limit: int | None, findings: Findings) -> Survey:
                 piles.add(episode.actions)
             progress.to(progress.done + len(episode))
     piles.report(findings)
-    _seeds(found.seeds, findings)
-    return found
+    _seeds(result.seeds, findings)
+    return result
 
 
 def _check(
@@ -140,30 +140,30 @@ class _Piles:
         for side, name in enumerate(("at least", "at most")):
             piled = inside[side] & (self.counts[side] >= max(PILE, PILE_SHARE * self.total))
             for i in np.argwhere(piled):
-                place = tuple(i)
+                index = tuple(i)
                 # one constant action is no clipping
-                if self.counts[side][place] < self.total:
-                    detail = f"{self.counts[side][place]:,} are exactly {self.ends[side][place]:g}, all {name} that"
-                    findings.add("clipped-actions", f"action {'.'.join(map(str, place))}", detail)
+                if self.counts[side][index] < self.total:
+                    detail = f"{self.counts[side][index]:,} are exactly {self.ends[side][index]:g}, all {name} that"
+                    findings.add("clipped-actions", f"action {'.'.join(map(str, index))}", detail)
 
 
 class _Twins:
     """Finds episodes that are there twice."""
 
     def __init__(self) -> None:
-        self.known: dict[bytes, int] = {}
+        self.first_index: dict[bytes, int] = {}
 
     def add(self, e: Recorded, findings: Findings) -> None:
         digest = hashlib.blake2b(digest_size=16)
         for array in (e.observations, e.actions, e.rewards):
             digest.update(np.ascontiguousarray(array).data)
-        first = self.known.setdefault(digest.digest(), e.index)
+        first = self.first_index.setdefault(digest.digest(), e.index)
         if first != e.index:
             findings.add("duplicate-episodes", f"episodes {first} and {e.index}")
 
 
 def _seeds(seeds: list[int | None], findings: Findings) -> None:
-    known: dict[int, int] = {}
+    first_episode: dict[int, int] = {}
     for i, seed in enumerate(seeds):
-        if seed is not None and known.setdefault(seed, i) != i:
-            findings.add("repeated-seeds", f"episodes {known[seed]} and {i}", f"seed {seed}")
+        if seed is not None and first_episode.setdefault(seed, i) != i:
+            findings.add("repeated-seeds", f"episodes {first_episode[seed]} and {i}", f"seed {seed}")

@@ -28,7 +28,7 @@ from offbench.rollouts.rollouts import Rollouts, result
 from offbench.verification.findings import Findings, Report
 from offbench.verification.metadata import check_claims
 from offbench.verification.resimulate import Verdict, check
-from offbench.verification.scan import Survey, survey
+from offbench.verification.scan import Survey, scan
 
 EPISODES = 300  # played again by default: half a minute for a million transitions
 SOME = 10  # of them tell the rule for contact margins, about
@@ -75,19 +75,19 @@ def _verify(dataset_id: str, episodes: int | None, workers: int | None) -> Repor
     spec = metadata.get("env_spec")
     try:
         with reading(dataset_id):
-            found = survey(data, _limit(spec), findings)
+            survey = scan(data, _limit(spec), findings)
     except DamagedError as error:
         findings.add("unreadable", dataset_id, str(error))
         return dataclasses.replace(report, findings=findings.all())
-    report.transitions, report.episodes = found.steps, len(found.lengths)
+    report.transitions, report.episodes = survey.steps, len(survey.lengths)
     report.checked.append("every episode: shapes, types, ends, finite numbers, bounds, duplicates, seeds")
-    if not found.steps:
+    if not survey.steps:
         findings.add("empty", dataset_id)
-    _counts(metadata, dataset_id, found, findings)
-    _terminations(found, _limit(spec), findings)
-    last = check_claims(minari_store.provenance(metadata), found, _limit(spec), report, findings)
-    chosen = _choose(found, _limit(spec), last, episodes)
-    _play(data, chosen, found, metadata, workers, report, findings)
+    _counts(metadata, dataset_id, survey, findings)
+    _terminations(survey, _limit(spec), findings)
+    last = check_claims(minari_store.provenance(metadata), survey, _limit(spec), report, findings)
+    chosen = _choose(survey, _limit(spec), last, episodes)
+    _play(data, chosen, survey, metadata, workers, report, findings)
     report.findings = findings.all()
     return report
 
@@ -101,17 +101,17 @@ def _limit(spec: str | None) -> int | None:
     return limit if isinstance(limit, int) and limit > 0 else None
 
 
-def _counts(metadata: dict[str, Any], dataset_id: str, found: Survey, findings: Findings) -> None:
-    for key, count in (("total_steps", found.steps), ("total_episodes", len(found.lengths))):
+def _counts(metadata: dict[str, Any], dataset_id: str, survey: Survey, findings: Findings) -> None:
+    for key, count in (("total_steps", survey.steps), ("total_episodes", len(survey.lengths))):
         if metadata.get(key) != count:
             findings.add("counts", "metadata", f"{key} is {metadata.get(key)}, the data have {count}")
     if metadata.get("dataset_id") != dataset_id:
         findings.add("metadata", "metadata", f"it calls itself {metadata.get('dataset_id')!r}")
 
 
-def _terminations(found: Survey, limit: int | None, findings: Findings) -> None:
+def _terminations(survey: Survey, limit: int | None, findings: Findings) -> None:
     """Report an environment's clock marked as termination: every termination lies exactly at the time limit."""
-    lengths = [length for length, (terminated, _) in zip(found.lengths, found.ended, strict=True) if terminated]
+    lengths = [length for length, (terminated, _) in zip(survey.lengths, survey.ended, strict=True) if terminated]
     if limit is not None and len(lengths) >= SEVERAL and set(lengths) == {limit}:
         detail = f"all {len(lengths):,} terminations lie exactly at the time limit of {limit:,} steps"
         findings.add("timeouts-as-terminations", "ends", detail)
@@ -120,7 +120,7 @@ def _terminations(found: Survey, limit: int | None, findings: Findings) -> None:
 def _play(
     data: Any,
     chosen: Sequence[int],
-    found: Survey,
+    survey: Survey,
     metadata: dict[str, Any],
     workers: int,
     report: Report,
@@ -131,7 +131,7 @@ def _play(
     if not spec:
         report.skipped.append("playing episodes again: the dataset names no environment")
         return
-    if not found.steps:
+    if not survey.steps:
         return
     if not chosen or not _same_spaces(spec, data, report, findings):
         return
@@ -140,7 +140,7 @@ def _play(
     if made is not None and not exact:
         report.warnings.append(f"recorded with mujoco {made}, installed is {here}: compared within a tolerance")
     last_unknown = minari_store.provenance(metadata).get("final_observations") == "repeated"
-    steps = sum(found.lengths[i] for i in chosen)
+    steps = sum(survey.lengths[i] for i in chosen)
     names = [int(data.episode_indices[i]) for i in chosen]
     with Rollouts(spec, workers if workers > 1 and steps > FEW else 0) as rollouts:
 
@@ -179,15 +179,15 @@ def _same_spaces(spec: str, data: Any, report: Report, findings: Findings) -> bo
     return same
 
 
-def _choose(found: Survey, limit: int | None, last: Sequence[int], episodes: int) -> list[int]:
+def _choose(survey: Survey, limit: int | None, last: Sequence[int], episodes: int) -> list[int]:
     """Return the episodes to play again: a random sample, the last of each part, and those that end at the limit."""
-    sound = [i for i, good in enumerate(found.sound) if good]
+    sound = [i for i, good in enumerate(survey.sound) if good]
     if not sound or episodes < 1:
         return []
     rng = seeds.generator(0, Purpose.SAMPLE)
     sample = rng.choice(sound, min(episodes, len(sound)), replace=False).tolist()
-    suspects = [i for i in sound if found.lengths[i] == limit and found.ended[i][0]][:episodes]
-    return sorted({*sample, *suspects, *(i for i in last if found.sound[i])})
+    suspects = [i for i in sound if survey.lengths[i] == limit and survey.ended[i][0]][:episodes]
+    return sorted({*sample, *suspects, *(i for i in last if survey.sound[i])})
 
 
 def _tell(verdicts: Sequence[Verdict], mujoco: str | None, report: Report, findings: Findings) -> None:

@@ -27,7 +27,7 @@ def test_three_seeds_by_hand(home: Path) -> None:
     scores(home / "runs", "bdb", [50.0, 50.0, 50.0], variant="beta=0.5")
     found = offbench.compare("td3_bc", "bdb/beta=0.5")
     # differences 1, 2, 3: see test_statistics.py for the interval and p
-    assert (found.statistics.difference.value, found.statistics.standardised, found.statistics.p) == (2.0, 2.0, 0.25)
+    assert (found.statistics.difference.value, found.statistics.standardized, found.statistics.p) == (2.0, 2.0, 0.25)
     assert (found.statistics.difference.low, found.statistics.difference.high) == (1.0, 3.0)
     assert found.chance.value == 1.0  # all nine pairs of runs
     # the interval leaves out 0, as three equal signs always make it; one time in four that is chance

@@ -83,7 +83,7 @@ def test_paired_by_hand() -> None:
     # more than 2.5%), the highest 3. Of 8 sign patterns only +++ and --- reach a mean of 2: p = 1/4
     found = paired({"one": [1.0, 2.0, 3.0]})
     assert found.difference == Estimate(2.0, 1.0, 3.0)
-    assert (found.standardised, found.p, found.pairs) == (2.0, 0.25, 3)
+    assert (found.standardized, found.p, found.pairs) == (2.0, 0.25, 3)
 
 
 def test_paired_weighs_tasks_equally() -> None:
@@ -93,11 +93,11 @@ def test_paired_weighs_tasks_equally() -> None:
     assert found.p == 2 / 64  # all six of one sign, or all of the other
 
 
-def test_a_difference_that_does_not_vary_is_not_standardised() -> None:
+def test_a_difference_that_does_not_vary_is_not_standardized() -> None:
     found = paired({"one": [0.0, 0.0]})
-    assert (found.difference, found.standardised, found.p) == (Estimate(0.0, 0.0, 0.0), None, 1.0)
+    assert (found.difference, found.standardized, found.p) == (Estimate(0.0, 0.0, 0.0), None, 1.0)
     alone = paired({"one": [5.0]})
-    assert (alone.difference, alone.standardised, alone.p) == (Estimate(5.0), None, 1.0)
+    assert (alone.difference, alone.standardized, alone.p) == (Estimate(5.0), None, 1.0)
 
 
 def test_many_pairs_are_sampled() -> None:

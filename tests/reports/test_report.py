@@ -139,7 +139,7 @@ def test_tasks_and_methods_in_the_papers_order(home: Path) -> None:
     ],
 )
 def test_environment_and_level_of_a_dataset(dataset: str, place: tuple[str, str]) -> None:
-    assert Task(dataset, "", None).place == place
+    assert Task(dataset, "", None).env_and_level == place
 
 
 def test_the_published_numbers_are_found_by_method() -> None:
