@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from offbench.algorithm.capture import one_call
+from offbench.algorithm.cpu_capture import one_call
 from offbench.algorithm.stacked import layers_of, one_by_one, stacked
 
 _WAY = ContextVar("way", default="numpy")

@@ -13,8 +13,8 @@ from offbench.common.errors import OffbenchError
 from offbench.data import minari_store
 from offbench.data.collect import collect
 from offbench.data.levels import full_size, parse_level
-from offbench.envs.contact_margin import without_margin
 from offbench.envs.environments import same_environment
+from offbench.envs.margin_rule import without_margin
 from offbench.envs.recipes import Recipe, load_recipe
 
 WAIT = 5.0  # seconds between two checks of a dataset that another process records

@@ -54,7 +54,7 @@ def behaviour_arguments(parser: Parser, _: list[str]) -> None:
 
     def run(**arguments: Any) -> None:
         from offbench.agents.behaviour import behaviour
-        from offbench.data.references import warn_other_references
+        from offbench.data.other_references import warn_other_references
         from offbench.envs.recipes import load_recipe
 
         ladder = behaviour(**arguments)

@@ -25,10 +25,10 @@ from offbench.data import minari_store
 from offbench.data.behaviour_policy import BehaviourPolicy, level_name, read_behaviour_policy
 from offbench.data.card import compare
 from offbench.data.levels import Part, full_size, parse_level, parse_mix, shares
-from offbench.data.references import warn_other_references
-from offbench.envs.contact_margin import MARGIN, without_margin
+from offbench.data.other_references import warn_other_references
+from offbench.envs.contact_margins import model_of
 from offbench.envs.environments import make_env
-from offbench.envs.physics import model_of
+from offbench.envs.margin_rule import MARGIN, without_margin
 from offbench.envs.recipes import Recipe, load_recipe
 from offbench.rollouts.function_policy import FunctionPolicy
 from offbench.rollouts.policy import Policy, uniform

@@ -15,7 +15,7 @@ from minari.serialization import deserialize_space
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.data import minari_store
-from offbench.envs.contact_margin import without_margin
+from offbench.envs.margin_rule import without_margin
 
 COLUMNS = ("observations", "actions", "rewards", "terminals")
 SEEDS = ("infos/seed", "infos/seeded")  # seeded: where some episodes have a seed of 2**63 or more, and some none

@@ -33,8 +33,8 @@ from offbench.common.progress import Progress
 from offbench.common.provenance import versions
 from offbench.data import minari_store
 from offbench.data.d4rl_file import NUMBERS, SEEDS, Source, read_source
-from offbench.envs.contact_margin import ADDED, MARGIN, without_margin
 from offbench.envs.environments import box, make_env, time_limit
+from offbench.envs.margin_rule import ADDED, MARGIN, without_margin
 from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference, load_recipe, names
 from offbench.rollouts.rollouts import Episode
 

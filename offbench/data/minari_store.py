@@ -22,7 +22,7 @@ from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
 from offbench.common.files import disk_errors, exclusive_lock, read_json
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.data.levels import parse_level
-from offbench.envs.contact_margin import ADDED, EARLIER, MARGIN, without_margin
+from offbench.envs.margin_rule import ADDED, EARLIER, MARGIN, without_margin
 from offbench.envs.recipes import load_recipe, names
 from offbench.rollouts.rollouts import Episode
 

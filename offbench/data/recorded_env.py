@@ -13,8 +13,8 @@ from offbench.common.errors import OffbenchError
 from offbench.common.provenance import versions
 from offbench.data import minari_store
 from offbench.envs import environments
-from offbench.envs.contact_margin import ADDED, EARLIER, MARGIN, SINCE, with_margin
 from offbench.envs.environments import believed_env
+from offbench.envs.margin_rule import ADDED, EARLIER, MARGIN, SINCE, with_margin
 from offbench.envs.recipes import load_recipe, names
 
 CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d+)(?:\.(\d+))?")  # of a requirement: `>=3.1.0,<3.2.0` has two
@@ -85,7 +85,7 @@ def recorded_mujoco(metadata: dict[str, Any]) -> str | None:
 
 def margins_matter(spec: str) -> bool:
     """Return whether the rule for contact margins makes a difference in an environment (EnvSpec JSON)."""
-    from offbench.envs.physics import has_margins, model_of  # imports MuJoCo, which is slow to load
+    from offbench.envs.contact_margins import has_margins, model_of  # imports MuJoCo, which is slow to load
 
     env = environments.make_env(spec)
     model = model_of(env)

@@ -4,7 +4,7 @@ An EnvSpec names the code that makes the environment, so one that came in a file
 
 The EnvSpecs that offbench passes around, and keeps in runs, may have a field that Gymnasium's have not,
 `contact_margin`: "sum" is the rule of MuJoCo 3.5 and later, "max", the default, that of earlier versions
-(offbench.envs.physics). Minari's metadata get the plain EnvSpec.
+(offbench.envs.contact_margins). Minari's metadata get the plain EnvSpec.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError, drawing_variable
-from offbench.envs.contact_margin import EARLIER, MARGIN, without_margin
+from offbench.envs.margin_rule import EARLIER, MARGIN, without_margin
 from offbench.envs.trust import check_code
 
 WHAT_MATTERS = ("id", "kwargs", "max_episode_steps")  # with the contact margins, what makes two specs the same
@@ -166,7 +166,7 @@ def make_env(spec: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
         options: dict[str, Any] = {"render_mode": render_mode} if render_mode else {}  # else the EnvSpec's own
         env = gym.make(made, **options)
     if hasattr(env.unwrapped, "model"):
-        from offbench.envs.physics import model_of, set_contacts  # imports MuJoCo, which is slow to load
+        from offbench.envs.contact_margins import model_of, set_contacts  # imports MuJoCo, which is slow to load
 
         if (model := model_of(env)) is not None:
             set_contacts(model, rule, made.id)

@@ -20,8 +20,8 @@ from typing import Any
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import damage, read_text
 from offbench.common.settings import build, setting
-from offbench.envs.contact_margin import ADDED, EARLIER, with_margin
 from offbench.envs.environments import env_spec
+from offbench.envs.margin_rule import ADDED, EARLIER, with_margin
 
 
 @dataclass(frozen=True)

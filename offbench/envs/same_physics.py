@@ -19,9 +19,9 @@ def warn_other_physics(what: str, recorded: dict[str, str], spec: str) -> None:
 
 
 def _same_physics(a: str, b: str, spec: str) -> bool:
-    """Return whether an environment moves alike on two MuJoCo versions; see offbench.physics."""
+    """Return whether an environment moves alike on two MuJoCo versions; see offbench.envs.contact_margins."""
+    from offbench.envs.contact_margins import RK4_ROTATIONS_SINCE, model_of, release, rotations_changed
     from offbench.envs.environments import make_env
-    from offbench.envs.physics import RK4_ROTATIONS_SINCE, model_of, release, rotations_changed
 
     try:
         if (release(a) >= RK4_ROTATIONS_SINCE) == (release(b) >= RK4_ROTATIONS_SINCE):

@@ -15,8 +15,8 @@ from offbench.common.processes import default_workers
 from offbench.common.scores import interval, normalize
 from offbench.common.seeds import Purpose
 from offbench.common.text import counted
-from offbench.envs.contact_margin import ADDED, SINCE, without_margin
 from offbench.envs.environments import checked_spec, env_spec, same_environment
+from offbench.envs.margin_rule import ADDED, SINCE, without_margin
 from offbench.envs.recipes import d4rl_reference, load_recipe
 from offbench.envs.trust import REMEDY, is_trusting
 from offbench.rollouts.policy import Policy, load_policy

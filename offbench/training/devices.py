@@ -1,8 +1,7 @@
-"""The machine that runs train on: its device, its processes, the precision and the size of a stack."""
+"""The machine that runs train on: its device, its processes and the precision of its products."""
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -15,14 +14,8 @@ from offbench.algorithm.mlp import products_by
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import default_workers
 from offbench.common.provenance import has_bfloat16
-from offbench.data.transitions import Transitions
-from offbench.training.registry import load_algorithm
-from offbench.training.spec import RunSpec
-from offbench.training.stack import WARM_UP, Stack
 
-CPU_STACK = 8  # runs of one process: more runs gain nothing there, and each waits for all of them
 PRECISIONS = ("float32", "tf32", "bfloat16")
-MEMORY_SHARE = 0.8  # of a GPU's free memory that a stack may take
 
 
 @dataclass(frozen=True)
@@ -116,27 +109,3 @@ def arithmetic(device: str, precision: str = "float32") -> Iterator[None]:
             undo.enter_context(threadpoolctl.threadpool_limits(1, user_api="blas"))
             undo.enter_context(np.errstate(all="ignore"))  # a run that diverges is reported once, by Stack.diverged
         yield
-
-
-def stack_size(spec: RunSpec, data: Transitions, device: str) -> int:
-    """Return how many runs like `spec` train best as one stack on this device.
-
-    On a GPU it is what the free memory holds, measured: the peak memory of stacks of one and of three runs over a few
-    updates tells what a run takes in addition to the dataset.
-    """
-    if device == "cpu":
-        return CPU_STACK
-    peaks = []
-    for runs in (1, 3):
-        torch.cuda.reset_peak_memory_stats(device)
-        before = torch.cuda.memory_reserved(device)
-        stack = Stack(load_algorithm(spec.algorithm), [spec] * runs, {spec.dataset: data}, device)
-        for _ in stack.train(4 * WARM_UP):
-            pass
-        peaks.append(torch.cuda.max_memory_reserved(device) - before)
-        del stack
-        gc.collect()
-        torch.cuda.empty_cache()
-    cost = max((peaks[1] - peaks[0]) / 2, 1.0)
-    free, _ = torch.cuda.mem_get_info(device)
-    return max(1, int((MEMORY_SHARE * free - peaks[0]) / cost) + 1)

@@ -8,11 +8,13 @@ pending    what is left of a job: runs at one common step; finished and diverged
 from __future__ import annotations
 
 import dataclasses
+import gc
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import torch
 
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
@@ -24,10 +26,15 @@ from offbench.data.transitions import Transitions
 from offbench.envs.environments import checked_spec, same_environment
 from offbench.envs.recipes import d4rl_reference
 from offbench.envs.same_physics import warn_other_physics
-from offbench.training.devices import Machine, stack_size
+from offbench.training.devices import Machine
+from offbench.training.registry import load_algorithm
 from offbench.training.run import RunConfig
 from offbench.training.source_code import code_of
 from offbench.training.spec import Job, RunSpec, settings_json
+from offbench.training.stack import WARM_UP, Stack
+
+CPU_STACK = 8  # runs of one process: more runs gain nothing there, and each waits for all of them
+MEMORY_SHARE = 0.8  # of a GPU's free memory that a stack may take
 
 Datasets = Mapping[str, Transitions]
 
@@ -79,6 +86,30 @@ def group(specs: Sequence[RunSpec], datasets: Datasets, machine: Machine) -> lis
             for indices in np.array_split(np.arange(len(runs)), count):
                 jobs.append(Job(tuple(runs[i] for i in indices), machine.device, workers))
     return jobs
+
+
+def stack_size(spec: RunSpec, data: Transitions, device: str) -> int:
+    """Return how many runs like `spec` train best as one stack on this device.
+
+    On a GPU it is what the free memory holds, measured: the peak memory of stacks of one and of three runs over a few
+    updates tells what a run takes in addition to the dataset.
+    """
+    if device == "cpu":
+        return CPU_STACK
+    peaks = []
+    for runs in (1, 3):
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_reserved(device)
+        stack = Stack(load_algorithm(spec.algorithm), [spec] * runs, {spec.dataset: data}, device)
+        for _ in stack.train(4 * WARM_UP):
+            pass
+        peaks.append(torch.cuda.max_memory_reserved(device) - before)
+        del stack
+        gc.collect()
+        torch.cuda.empty_cache()
+    cost = max((peaks[1] - peaks[0]) / 2, 1.0)
+    free, _ = torch.cuda.mem_get_info(device)
+    return max(1, int((MEMORY_SHARE * free - peaks[0]) / cost) + 1)
 
 
 def _alike(specs: Sequence[RunSpec], datasets: Datasets) -> list[list[RunSpec]]:

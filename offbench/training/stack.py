@@ -1,7 +1,7 @@
 """A stack: runs that learn as one program.
 
 Program   one update of every run, fed from fixed buffers: it is captured once for each phase and then replayed,
-          on a GPU as a CUDA graph, on a CPU by offbench.algorithm.capture
+          on a GPU as a CUDA graph, on a CPU by offbench.algorithm.cpu_capture
 Stack     the learning state of the runs: train, log, policies, what a checkpoint keeps
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from offbench.algorithm.capture import NotCapturableError, Recording, attributes, changed_attribute, record
+from offbench.algorithm.cpu_capture import NotCapturableError, Recording, attributes, changed_attribute, record
 from offbench.algorithm.interface import Algorithm, PolicyParts, check_logs, stack_configs
 from offbench.common.errors import OffbenchError
 from offbench.data.transitions import Transitions

@@ -22,8 +22,8 @@ from offbench.data import minari_store
 from offbench.data.file_stamps import unchanged
 from offbench.data.minari_reader import Recorded, episodes_of, reading
 from offbench.data.recorded_env import margins_matter, recorded_margin, recorded_mujoco
-from offbench.envs.contact_margin import ADDED, EARLIER, SINCE, with_margin
 from offbench.envs.environments import believed_env, box, same_bounds
+from offbench.envs.margin_rule import ADDED, EARLIER, SINCE, with_margin
 from offbench.rollouts.rollouts import Rollouts, result
 from offbench.verification.findings import Findings, Report
 from offbench.verification.metadata import check_claims

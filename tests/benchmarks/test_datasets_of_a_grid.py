@@ -18,7 +18,7 @@ from offbench.benchmarks.grid import Source
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.data.card import card
-from offbench.data.references import warn_other_references
+from offbench.data.other_references import warn_other_references
 from offbench.envs.recipes import load_recipe
 
 AGAIN = r"record it again \(`offbench collect .* --overwrite`\)"

@@ -18,9 +18,9 @@ from offbench.common import seeds
 from offbench.common.seeds import Purpose
 from offbench.data import minari_store
 from offbench.data.recorded_env import recorded_margin
-from offbench.envs.contact_margin import ADDED, EARLIER, with_margin, without_margin
+from offbench.envs.contact_margins import SUMMED_SINCE, release
 from offbench.envs.environments import env_spec
-from offbench.envs.physics import SUMMED_SINCE, release
+from offbench.envs.margin_rule import ADDED, EARLIER, with_margin, without_margin
 from offbench.rollouts.policy import load_policy
 from offbench.verification.verify import verify
 

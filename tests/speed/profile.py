@@ -17,7 +17,7 @@ import torch
 
 from offbench.agents.ladder import read_ladder
 from offbench.algorithm import mlp
-from offbench.algorithm.capture import Recording
+from offbench.algorithm.cpu_capture import Recording
 from offbench.algorithm.mlp import products_by
 from offbench.common.files import write_bytes
 from offbench.common.provenance import hardware, has_bfloat16

@@ -16,7 +16,7 @@ from offbench.training.devices import PRECISIONS, arithmetic
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run
 from offbench.training.stack import Stack
-from tests.algorithm.test_capture import CASES, SMALL, stack_of, trained
+from tests.algorithm.test_cpu_capture import CASES, SMALL, stack_of, trained
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 

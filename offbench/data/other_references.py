@@ -1,4 +1,4 @@
-"""What datasets are taken for: by a grid, and beside the other datasets of their environment."""
+"""Warn about datasets whose reference scores are not those of their environment's ladder."""
 
 from __future__ import annotations
 

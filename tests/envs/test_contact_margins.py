@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from offbench.envs import same_physics
-from offbench.envs.contact_margin import ADDED, EARLIER
-from offbench.envs.physics import GAP_OUTSIDE_SINCE, SUMMED_SINCE, release, rotations_changed, set_contacts
+from offbench.envs.contact_margins import GAP_OUTSIDE_SINCE, SUMMED_SINCE, release, rotations_changed, set_contacts
+from offbench.envs.margin_rule import ADDED, EARLIER
 from offbench.envs.recipes import load_recipe
 from tests.conftest import ROOT
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from offbench.algorithm import Algorithm, Batch, Logs, Noise
-from offbench.algorithm.capture import NotCapturableError, record
+from offbench.algorithm.cpu_capture import NotCapturableError, record
 from offbench.benchmarks.throughput import random_stack
 from offbench.common.errors import OffbenchError
 from offbench.common.settings import build, setting

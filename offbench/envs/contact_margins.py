@@ -27,7 +27,7 @@ import mujoco
 import numpy as np
 
 from offbench.common.arrays import Array
-from offbench.envs.contact_margin import ADDED, EARLIER, SINCE
+from offbench.envs.margin_rule import ADDED, EARLIER, SINCE
 
 SUMMED_SINCE, GAP_OUTSIDE_SINCE, RK4_ROTATIONS_SINCE = (3, 5), (3, 9), (4, 0)
 ROUNDING = 1e-12  # of a sum of two margins, in the model's unit of length
