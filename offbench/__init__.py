@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from offbench.data.card import card
     from offbench.data.collect import collect
     from offbench.data.export import export
+    from offbench.data.huggingface_card import huggingface_card
     from offbench.data.import_d4rl import import_d4rl
     from offbench.data.recorded_env import make_env
     from offbench.data.show import show
@@ -52,6 +53,7 @@ __all__ = [
     "evaluate",
     "export",
     "export_policy",
+    "huggingface_card",
     "import_d4rl",
     "inventory",
     "load",
@@ -76,6 +78,7 @@ _VERBS = {
     "evaluate": ("offbench.evaluation.evaluate", "evaluate"),
     "export": ("offbench.data.export", "export"),
     "export_policy": ("offbench.evaluation.export_policy", "export_policy"),
+    "huggingface_card": ("offbench.data.huggingface_card", "huggingface_card"),
     "import_d4rl": ("offbench.data.import_d4rl", "import_d4rl"),
     "inventory": ("offbench.tools.inventory", "inventory"),
     "load": ("offbench.data.transitions", "load"),

@@ -45,6 +45,7 @@ REASONS = (
     "another library's code",
     "changes your shell",
     "downloads from another server",
+    "uploads to another server",
 )
 LONGEST = 600.0  # seconds that a command may take: several times as long as any does
 FENCE = re.compile(

@@ -127,14 +127,31 @@ def show_arguments(parser: Parser, _: list[str]) -> None:
 
 def card_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `card`."""
-    _env(parser, "a shipped environment or a recipe file, its five levels recorded")
-    parser.add_argument("--out", metavar="DIR", help="folder of the card (default: <env>-card)")
+    about = parser.add_argument(
+        "about",
+        metavar="ENV_OR_ID",
+        help="a shipped environment or a recipe file, its five levels recorded; with --huggingface a dataset",
+    )
+    completed(about, lambda: [*recipes(), *local_datasets()])
+    parser.add_argument(
+        "--huggingface", action="store_true", help="write a dataset's card for the Hugging Face Hub instead"
+    )
+    parser.add_argument(
+        "--out",
+        metavar="PATH",
+        help="folder of the card (default: <env>-card); with --huggingface its file (default: in the dataset)",
+    )
     _behaviour_dir(parser)
 
-    def run(**arguments: Any) -> None:
-        from offbench.data.card import card
+    def run(about: str, huggingface: bool, out: str | None, behaviour_dir: str) -> None:
+        if huggingface:
+            from offbench.data.huggingface_card import huggingface_card
 
-        print(f"saved {card(**arguments)}")
+            print(f"saved {huggingface_card(about, out)}")
+        else:
+            from offbench.data.card import card
+
+            print(f"saved {card(about, out, behaviour_dir)}")
 
     parser.set_defaults(run=run)
 

@@ -48,7 +48,11 @@ COMMANDS: dict[str, dict[str, Command]] = {
             data.export_arguments,
             ["export hopper-medium-v0 --out hopper-medium.hdf5"],
         ),
-        "card": Command("write the dataset card of an environment", data.card_arguments, ["card hopper"]),
+        "card": Command(
+            "write the dataset card of an environment, or of a dataset for Hugging Face",
+            data.card_arguments,
+            ["card hopper", "card hopper-medium-v0 --huggingface"],
+        ),
         "behaviour": Command(
             "train a behaviour agent (SAC) and build its ladder of policies",
             data.behaviour_arguments,

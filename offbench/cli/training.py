@@ -15,7 +15,12 @@ from offbench.common.terminal import hint, note
 
 OPTIMIZATION = ("batch_size", "discount", "tau", "policy_freq", "normalize")  # settings that every method has
 
-SWITCHES = ("--tensorboard", "--trust", "--fresh")  # flags of `train` without a value: the algorithm may follow them
+SWITCHES = (
+    "--tensorboard",
+    "--trust",
+    "--fresh",
+    "--download",
+)  # flags of `train` without a value: the algorithm may follow them
 
 
 def train_arguments(parser: Parser, words: list[str]) -> None:
@@ -33,6 +38,9 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         "--env", metavar="RECIPE", help="the environment to evaluate in (default: the one that the dataset names)"
     )
     completed(env, recipes)
+    parser.add_argument(
+        "--download", action="store_true", help="download datasets that are not here from Minari's server first"
+    )
     parser.add_argument(
         "--seeds", type=seed_list, default=[0], metavar="LIST", help="seeds: 3, 0,1,2 or 0:5 (0 to 4) (default: 0)"
     )

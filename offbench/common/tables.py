@@ -79,10 +79,10 @@ class Table:
 
     def markdown(self) -> str:
         """Return title, table and notes as Markdown; the best in bold."""
-        cells = [[f"**{_plain(c.full)}**" if c.best else _plain(c.full) for c in row] for row in self.rows]
-        lines = markdown([_plain(text) for text in self.columns()], cells)
-        notes = [line for note in self.notes for line in ("", _plain(note))]
-        return "\n".join([f"## {_plain(self.title)}", "", *lines, *notes]) + "\n"
+        cells = [[f"**{plain(c.full)}**" if c.best else plain(c.full) for c in row] for row in self.rows]
+        lines = markdown([plain(text) for text in self.columns()], cells)
+        notes = [line for note in self.notes for line in ("", plain(note))]
+        return "\n".join([f"## {plain(self.title)}", "", *lines, *notes]) + "\n"
 
     def latex(self) -> str:
         """Return the table as LaTeX (booktabs), the notes as comments; the best in bold."""
@@ -104,7 +104,7 @@ def latex(text: str) -> str:
     return "".join(SPECIAL.get(character, character) for character in text)
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
     """Return text that Markdown prints as it is."""
     escaped = "".join("\\" + c if c in "\\`*_[]|#" else c for c in text)
     return html.escape(escaped, quote=False).replace("\n", " ")

@@ -110,7 +110,9 @@ def _not_downloaded(dataset_id: str) -> OffbenchError:
     """Return the error for an id with a namespace, as Minari's server has them (`mujoco/hopper/medium-v0`)."""
     near = nearest(dataset_id, (name for name in local_ids() if "/" in name))
     hint = f"did you mean {near!r}? Or download it" if near else "download it"
-    return OffbenchError(f"no local dataset {dataset_id!r}: {hint} with `minari download {dataset_id}`")
+    return OffbenchError(
+        f"no local dataset {dataset_id!r}: {hint} with `minari download {dataset_id}`, or `train --download`"
+    )
 
 
 def read_metadata(dataset_id: str) -> dict[str, Any]:
@@ -287,12 +289,21 @@ def write(
                 )
             ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
             storage.update_metadata(metadata | {KEY: ours})
+            _write_namespaces(path)
             if path.exists():
                 path.replace(_old(path))
             aside.replace(path)
         finally:
             _recover(path)
     return content.hexdigest()
+
+
+def _write_namespaces(path: Path) -> None:
+    """Write the metadata of a dataset's namespaces where there are none, which `minari upload` needs."""
+    for parent in path.relative_to(root()).parents[:-1]:
+        file = root() / parent / "namespace_metadata.json"
+        if not file.exists():
+            file.write_text("{}", encoding="utf-8")
 
 
 def _old(path: Path) -> Path:

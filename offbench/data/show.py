@@ -33,7 +33,7 @@ class Summary:
         low, high = meta.get("ref_min_score"), meta.get("ref_max_score")
         lines = [
             f"{self.dataset_id}: {meta.get('description', 'no description')}",
-            f"spaces       observations {_space(meta, 'observation_space')}, actions {_space(meta, 'action_space')}",
+            f"spaces       observations {space(meta, 'observation_space')}, actions {space(meta, 'action_space')}",
             f"episodes     {len(self.returns):,}, {int(self.lengths.sum()):,} transitions, "
             f"length {self.lengths.mean():.0f} ({self.lengths.min()} to {self.lengths.max()}), "
             f"{100 * self.terminated:.0f}% terminated",
@@ -46,11 +46,11 @@ class Summary:
         lines += ["", *_histogram(self.returns), ""]
         lines.append("provenance")
         for part in ours.get("parts", []):
-            lines += ["  part", *(f"    {key:<15} {_fact(value)}" for key, value in part.items())]
+            lines += ["  part", *(f"    {key:<15} {fact(value)}" for key, value in part.items())]
         told = {name: ours.get(name) for name in ("env", "level", "seed", "content_sha256", "recipe_sha256")}
         told["imported from"] = ours.get("imported", {}).get("file")
         told |= {f"{name} version": version for name, version in ours.get("versions", {}).items()}
-        shown = [f"  {key:<17} {_fact(value)}" for key, value in told.items() if value is not None]
+        shown = [f"  {key:<17} {fact(value)}" for key, value in told.items() if value is not None]
         return lines + (shown or ["  not recorded by offbench"])
 
     def __repr__(self) -> str:
@@ -84,16 +84,17 @@ def show(dataset_id: str) -> Summary:
     return Summary(dataset_id, data.metadata, np.asarray(data.returns), lengths, terminated)
 
 
-def _fact(value: Any) -> str:
+def fact(value: Any) -> str:
     """Return a value of the metadata as a person writes it."""
     if isinstance(value, bool) or not isinstance(value, int | float | list):
         return str(value)
     if isinstance(value, list):
-        return " to ".join(map(_fact, value))
+        return " to ".join(map(fact, value))
     return f"{value:,}" if isinstance(value, int) else f"{value:,.4g}" if abs(value) < 100 else f"{value:,.1f}"
 
 
-def _space(metadata: dict[str, Any], key: str) -> str:
+def space(metadata: dict[str, Any], key: str) -> str:
+    """Return a space of the metadata, e.g. `Box (11,) float64`."""
     import json
 
     try:

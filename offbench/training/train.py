@@ -34,6 +34,7 @@ def train(
     dataset: str | Sequence[str],
     *,
     env: str | None = None,
+    download: bool = False,
     seeds: int | Sequence[int] = 0,
     steps: int = 1_000_000,
     eval_every: int = 5_000,
@@ -55,6 +56,7 @@ def train(
         algorithm: a registered name (td3_bc, bdb, cql, or a third party's), a file `./my_algo.py:ReBRAC`, or a class.
         dataset: one id of a local Minari dataset, or several.
         env: the recipe's name or file of the environment to evaluate in, instead of the one that the dataset names.
+        download: fetch datasets that are not here from Minari's server first.
         seeds: one seed or several; a run's random numbers depend on its own seed alone.
         steps: updates of each run.
         eval_every, eval_episodes: updates between evaluations, and episodes of the deterministic policy in each.
@@ -84,6 +86,11 @@ def train(
     _check_times(times)
     if not names:
         raise OffbenchError("give at least one dataset")
+    if download:
+        from offbench.data.download import download as fetch
+
+        for name in names:
+            fetch(name)
     specs = [spec for name in names for variant in variants for spec in variant if spec.dataset == name]
     machine = pick_machine(device, workers, stack, precision)
     show = Destinations(tensorboard, wandb)

@@ -1,0 +1,80 @@
+"""`train --download`: datasets of Minari's server, whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from offbench.common.errors import OffbenchError
+from offbench.common.files import disk_errors, exclusive_lock
+from offbench.common.text import printable
+from offbench.data import minari_store
+
+
+def download(dataset_id: str) -> None:
+    """Download a dataset with Minari, and those that it is combined from, unless it is here already.
+
+    Minari's `download_dataset` writes into a hidden folder, and what is complete is then moved to its place.
+
+    Raises:
+        OffbenchError: not an id, no such dataset on the server, no connection, or Minari's client is not installed.
+    """
+    if minari_store.exists(dataset_id):
+        return
+    target = minari_store.path_of(dataset_id)
+    root = minari_store.root()
+    with exclusive_lock(root / ".offbench-download.lock", "another dataset is being downloaded"):
+        if minari_store.exists(dataset_id):  # another process was faster
+            return
+        aside = root / ".offbench-download"
+        shutil.rmtree(aside, ignore_errors=True)  # of a download that was killed
+        try:
+            with _minari_in(aside):
+                _fetch(dataset_id)
+            with disk_errors(str(root)):
+                _move(aside, root)
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
+    if not target.exists():
+        raise OffbenchError(f"Minari's server sent no dataset {dataset_id}")
+
+
+def _fetch(dataset_id: str) -> None:
+    import minari
+
+    try:
+        with contextlib.redirect_stdout(sys.stderr):  # stdout is for the runs' folders
+            minari.download_dataset(dataset_id)
+    except ImportError as error:
+        raise OffbenchError(f"cannot download {dataset_id}: {error}") from None
+    except Exception as error:  # of Minari, its clients and the network
+        reason = " ".join(printable(str(error) or type(error).__name__).split())
+        raise OffbenchError(f"cannot download {dataset_id}: {reason}") from error
+
+
+@contextlib.contextmanager
+def _minari_in(folder: Path) -> Iterator[None]:
+    """Let Minari take another folder for that of its datasets."""
+    before = os.environ.get("MINARI_DATASETS_PATH")
+    os.environ["MINARI_DATASETS_PATH"] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["MINARI_DATASETS_PATH"]
+        else:
+            os.environ["MINARI_DATASETS_PATH"] = before
+
+
+def _move(aside: Path, root: Path) -> None:
+    """Move datasets and the descriptions of their namespaces to their places, what is there already left alone."""
+    datasets = [path.parent.parent for path in aside.glob("**/data/metadata.json")]
+    for path in [*aside.glob("**/namespace_metadata.json"), *datasets]:
+        inside = path.relative_to(aside)
+        if not any(part.startswith(".") for part in inside.parts) and not (root / inside).exists():
+            (root / inside).parent.mkdir(parents=True, exist_ok=True)
+            path.replace(root / inside)
