@@ -103,7 +103,10 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "export-policy": Command(
             "write a policy for use without offbench",
             results.export_policy_arguments,
-            ["export-policy runs/hopper-medium-v0/td3_bc/default/seed-0 --out policy.pt"],
+            [
+                "export-policy runs/hopper-medium-v0/td3_bc/default/seed-0 --out policy.pt",
+                "export-policy agent.safetensors --out policy.onnx",
+            ],
         ),
     },
     "Tools": {

@@ -164,7 +164,7 @@ def video_arguments(parser: Parser, _: list[str]) -> None:
 def export_policy_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `export-policy`."""
     parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run directory or a policy file")
-    parser.add_argument("--out", required=True, metavar="FILE", help="the file to write: .pt (TorchScript)")
+    parser.add_argument("--out", required=True, metavar="FILE", help="the file to write: .pt (TorchScript) or .onnx")
 
     def run(**arguments: Any) -> None:
         from offbench.evaluation.export_policy import export_policy

@@ -1,11 +1,13 @@
-"""`export-policy`: a trained policy as TorchScript, which runs without offbench."""
+"""`export-policy`: a trained policy as TorchScript or ONNX, which run without offbench."""
 
 # no `from __future__ import annotations` here: TorchScript reads the annotations of Actor
 import io
 import json
 import warnings
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -15,8 +17,9 @@ from offbench.common.files import output_file, write_bytes
 from offbench.rollouts.policy import Policy, load_policy
 from offbench.training.run import Run
 
-ENDINGS = (".pt", ".pth", ".ts")
+TORCHSCRIPT, ONNX = (".pt", ".pth", ".ts"), ".onnx"
 ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
+OPSET, IR_VERSION = 13, 8  # of ONNX: read by every onnxruntime since 1.10
 
 
 class Actor(nn.Module):
@@ -39,6 +42,7 @@ class Actor(nn.Module):
             layers += [linear, ACTIVATIONS[policy.activation]()]
         self.network = nn.Sequential(*layers[:-1]).requires_grad_(False)
         self.actions = len(policy.low)
+        self.squashed = policy.kind != "gaussian"
         self.register_buffer("mean", _double(policy.observation_mean))
         self.register_buffer("std", _double(policy.observation_std))
         self.register_buffer("low", _double(policy.low))
@@ -47,9 +51,10 @@ class Actor(nn.Module):
     def forward(self, observations: Tensor) -> Tensor:
         """Return the actions."""
         out = self.network((observations.to(torch.float64) - self.mean) / self.std)
-        squashed = torch.tanh(out[..., : self.actions])  # a Gaussian's other half is its log std
-        scaled = self.low + (squashed + 1.0) * (self.high - self.low) / 2.0
-        return torch.minimum(torch.maximum(scaled, self.low), self.high).to(torch.float32)
+        actions = out[..., : self.actions]  # a Gaussian's other half is its log std
+        if self.squashed:
+            actions = self.low + (torch.tanh(actions) + 1.0) * (self.high - self.low) / 2.0
+        return torch.minimum(torch.maximum(actions, self.low), self.high).to(torch.float32)
 
 
 def _double(array: Array) -> Tensor:
@@ -57,26 +62,82 @@ def _double(array: Array) -> Tensor:
 
 
 def export_policy(path: str | Path, out: str | Path) -> Path:
-    """Write a run's policy, or a policy file, as TorchScript: `torch.jit.load(out)(observations)` acts.
+    """Write a run's policy, or a policy file, as TorchScript (`.pt`) or ONNX (`.onnx`).
 
-    The file also holds where the policy comes from (`_extra_files`, "offbench.json").
+    `torch.jit.load(out)(observations)` acts, as does
+    `onnxruntime.InferenceSession(out).run(None, {"observations": observations})[0]`. Observations are `[n, obs]`, of
+    any float type for TorchScript and float64 for ONNX; actions are `[n, act]`, float32. The file also holds where the
+    policy comes from: `_extra_files` "offbench.json", or ONNX's `metadata_props` "offbench".
 
     Raises:
-        OffbenchError: there is no policy, it has no single best action, the file does not end in .pt, its folder does
-            not exist, or it cannot be written.
+        OffbenchError: there is no policy, it has no single best action, the file ends in neither, its folder does not
+            exist, it cannot be written, or the package onnx is not installed.
     """
     source, target = Path(path), output_file(out)
-    if target.suffix.lower() not in ENDINGS:
-        raise OffbenchError(f"cannot write {target.name!r}: policies are exported as TorchScript; give --out FILE.pt")
+    ending = target.suffix.lower()
+    if ending not in (*TORCHSCRIPT, ONNX):
+        raise OffbenchError(
+            f"cannot write {target.name!r}: policies become TorchScript or ONNX; give --out FILE.pt or FILE.onnx"
+        )
     policy = load_policy(Run(source).policy_path if source.is_dir() else source)
-    if policy.kind not in ("tanh", "squashed_gaussian"):
+    if policy.kind not in ("tanh", "squashed_gaussian", "gaussian"):
         reason = "chooses among random actions" if policy.kind == "best_by_q" else "is random"
         raise OffbenchError(f"{path} {reason} ({policy.kind}); only policies with one best action can be exported")
-    data, origin = io.BytesIO(), {"env_id": policy.env_id, "kind": policy.kind, "origin": policy.origin}
+    origin = json.dumps({"env_id": policy.env_id, "kind": policy.kind, "origin": policy.origin})
+    write_bytes(target, _onnx(policy, origin) if ending == ONNX else _torchscript(policy, origin))
+    return target
+
+
+def _torchscript(policy: Policy, origin: str) -> bytes:
+    data = io.BytesIO()
     with warnings.catch_warnings():
         # deprecated, but every PyTorch since 1.0 reads it; files of torch.export need the version that wrote them
         warnings.simplefilter("ignore", DeprecationWarning)
         scripted = torch.jit.script(Actor(policy).eval())
-        torch.jit.save(scripted, data, _extra_files={"offbench.json": json.dumps(origin)})
-    write_bytes(target, data.getvalue())
-    return target
+        torch.jit.save(scripted, data, _extra_files={"offbench.json": origin})
+    return data.getvalue()
+
+
+def _onnx(policy: Policy, origin: str) -> bytes:
+    """Return `Actor` as an ONNX graph, in float64 until its end."""
+    try:
+        from onnx import TensorProto, checker, helper, numpy_helper
+    except ImportError:
+        raise OffbenchError("ONNX export needs the package onnx: pip install 'offbench[onnx]'") from None
+    constants: list[Any] = []
+    nodes: list[Any] = []
+
+    def constant(array: Any) -> str:
+        constants.append(numpy_helper.from_array(np.ascontiguousarray(array), f"c{len(constants)}"))
+        return f"c{len(constants) - 1}"
+
+    def node(kind: str, *inputs: str, output: str = "", **attributes: Any) -> str:
+        output = output or f"x{len(nodes)}"
+        nodes.append(helper.make_node(kind, inputs, [output], **attributes))
+        return output
+
+    layers = [(weight.astype(np.float64), bias.astype(np.float64)) for weight, bias in policy.layers]
+    mean, std, low, high = (
+        np.asarray(array, np.float64)
+        for array in (policy.observation_mean, policy.observation_std, policy.low, policy.high)
+    )
+    actions = len(low)
+    layers[-1] = (layers[-1][0][:, :actions], layers[-1][1][:actions])  # a Gaussian's other half is its log std
+    x = node("Div", node("Sub", "observations", constant(mean)), constant(std))
+    for place, (weight, bias) in enumerate(layers):
+        x = node("Add", node("MatMul", x, constant(weight)), constant(bias))
+        if place < len(layers) - 1:
+            x = node({"relu": "Relu", "tanh": "Tanh"}[policy.activation], x)
+    if policy.kind != "gaussian":
+        x = node("Add", node("Tanh", x), constant(np.float64(1)))
+        x = node("Add", node("Mul", x, constant((high - low) / 2)), constant(low))
+    x = node("Min", node("Max", x, constant(low)), constant(high))
+    node("Cast", x, output="actions", to=TensorProto.FLOAT)
+    observations = helper.make_tensor_value_info("observations", TensorProto.DOUBLE, ["n", len(mean)])
+    result = helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["n", actions])
+    graph = helper.make_graph(nodes, "policy", [observations], [result], constants)
+    imports = [helper.make_opsetid("", OPSET)]
+    model = helper.make_model(graph, opset_imports=imports, producer_name="offbench", ir_version=IR_VERSION)
+    helper.set_model_props(model, {"offbench": origin})
+    checker.check_model(model)
+    return bytes(model.SerializeToString())

@@ -116,6 +116,12 @@ old_format = pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning
 OBSERVATIONS = np.random.default_rng(0).normal(scale=3, size=(500, 11))
 
 
+def onnx_actions(path: Path, observations: Any) -> Any:
+    """Act with onnxruntime."""
+    runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
+    return runtime.InferenceSession(path).run(None, {"observations": observations})[0]
+
+
 @old_format
 @pytest.mark.parametrize("kind", ["td3_bc", "bc", "the shipped expert"])
 def test_a_policy_as_torchscript_acts_the_same(kind: str, medium: str, home: Path) -> None:
@@ -137,6 +143,10 @@ def test_a_policy_as_torchscript_acts_the_same(kind: str, medium: str, home: Pat
     np.testing.assert_allclose(theirs.numpy(), ours, atol=1e-6)
     np.testing.assert_allclose(scripted(torch.from_numpy(observations[:1]).float()).numpy(), ours[:1], atol=1e-5)
     assert json.loads(extra["offbench.json"])["env_id"] == policy.env_id
+    onnx = offbench.export_policy(source, home / "policy.onnx")
+    found = onnx_actions(onnx, observations)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, ours, rtol=0, atol=1e-6)
     code = "import sys, torch; torch.jit.load('policy.pt')(torch.zeros(1, 11)[:, :int(sys.argv[1])]); " + (
         "assert not any(name.startswith('offbench') for name in sys.modules)"
     )
@@ -145,7 +155,7 @@ def test_a_policy_as_torchscript_acts_the_same(kind: str, medium: str, home: Pat
 
 @old_format
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
-@pytest.mark.parametrize("kind", ["tanh", "squashed_gaussian"])
+@pytest.mark.parametrize("kind", ["tanh", "squashed_gaussian", "gaussian"])
 def test_every_kind_that_acts_by_itself(kind: str, activation: str, home: Path, rng: np.random.Generator) -> None:
     """Bounds that are not symmetric, an odd normalisation, both activations."""
     sizes = [(5, 9), (9, 7), (7, 2 if kind == "tanh" else 4)]
@@ -156,14 +166,31 @@ def test_every_kind_that_acts_by_itself(kind: str, activation: str, home: Path, 
     policy.save(home / "policy.safetensors")
     scripted = torch.jit.load(export_policy(home / "policy.safetensors", home / "policy.pt"))
     observations = OBSERVATIONS[:, :5]
-    found = scripted(torch.from_numpy(observations)).numpy()
-    np.testing.assert_allclose(found, policy.act(observations, None), atol=1e-6)
-    assert (found >= low).all()
-    assert (found <= high).all()
+    ours = policy.act(observations, None)
+    assert len(np.unique(ours)) > 100  # not only the bounds
+    exported = export_policy(home / "policy.safetensors", home / "policy.onnx")
+    for found in (scripted(torch.from_numpy(observations)).numpy(), onnx_actions(exported, observations)):
+        np.testing.assert_allclose(found, ours, rtol=0, atol=1e-6)
+        assert (found >= low).all()
+        assert (found <= high).all()
+    import onnx
+
+    (origin,) = onnx.load(exported).metadata_props
+    assert json.loads(origin.value) == {"env_id": "X-v0", "kind": kind, "origin": {}}
 
 
 def test_policies_that_act_by_chance_are_refused(home: Path) -> None:
     uniform(-np.ones(1, np.float32), np.ones(1, np.float32), 4, "X-v0").save(home / "random.safetensors")
-    with pytest.raises(OffbenchError, match="is random"):
-        export_policy(home / "random.safetensors", home / "policy.pt")
-    assert not (home / "policy.pt").exists()
+    for name in ("policy.pt", "policy.onnx"):
+        with pytest.raises(OffbenchError, match="is random"):
+            export_policy(home / "random.safetensors", home / name)
+        assert not (home / name).exists()
+
+
+def test_onnx_export_names_the_package_it_needs(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ladder = read_ladder(shipped() / "hopper" / "behaviour")
+    assert ladder is not None
+    monkeypatch.setitem(sys.modules, "onnx", None)  # importing it fails
+    with pytest.raises(OffbenchError, match=r"pip install 'offbench\[onnx\]'"):
+        export_policy(ladder.folder / "policies" / ladder.role("expert").policy, home / "policy.onnx")
+    assert not (home / "policy.onnx").exists()

@@ -24,6 +24,12 @@ from offbench.data import minari_store
 SMALL = ["--steps", "2", "--eval-every", "2", "--eval-episodes", "1", "--workers", "1", "--hidden", "8"]
 
 
+@pytest.fixture
+def medium() -> str:
+    """The id of a small dataset of a shipped agent."""
+    return offbench.collect("inverted-pendulum", "medium", steps=600, workers=1)
+
+
 class LocalHub:
     """huggingface_hub's HfApi, as far as Minari calls it, over a folder with a folder for each repository."""
 
@@ -93,14 +99,14 @@ def elsewhere(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_minaris_remote_keeps_metadata_card_and_references(
-    tiny: tuple[str, str],
     hub: type[LocalHub],
     home: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Ids need a namespace: Minari 0.5.4 lists no others on the Hub."""
-    name = offbench.collect(tiny[0], "medium", behaviour_dir=tiny[1], workers=1, dataset_id="mine/tiny-medium-v0")
+    name = "mine/pendulum-medium-v0"
+    offbench.collect("inverted-pendulum", "medium", steps=600, workers=1, dataset_id=name)
     before, content = minari_store.read_metadata(name), offbench.load(name).content
     main(["card", name, "--huggingface"])
     card = (minari_store.path_of(name) / "README.md").read_text()
@@ -114,7 +120,7 @@ def test_minaris_remote_keeps_metadata_card_and_references(
     elsewhere(home, monkeypatch)
     capsys.readouterr()
     main(["train", "bc", "--dataset", name, "--download", *SMALL])
-    assert capsys.readouterr().out == "runs/mine/tiny-medium-v0/bc/hidden=8/seed-0\n"
+    assert capsys.readouterr().out == "runs/mine/pendulum-medium-v0/bc/hidden=8/seed-0\n"
     assert (minari_store.path_of(name) / "README.md").read_text() == card
     assert minari_store.read_metadata(name) == before
     data = offbench.load(name)
@@ -123,8 +129,7 @@ def test_minaris_remote_keeps_metadata_card_and_references(
     assert offbench.verify(name, workers=1).ok
     # and with Minari alone, into a third folder
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(home / "third"))
-    monkeypatch.delenv("MINARI_REMOTE")
-    minari.download_dataset(f"hf://me/{name}")
+    minari.download_dataset(name)
     assert minari_store.read_metadata(name) == before
 
 
@@ -134,7 +139,7 @@ def test_an_archive_for_a_colleague(medium: str, home: Path, monkeypatch: pytest
     subprocess.run(["tar", "-cf", f"{home}/data.tar", "-C", str(source), medium], check=True)
     elsewhere(home, monkeypatch)
     shutil.rmtree(source)
-    with pytest.raises(OffbenchError, match="unknown dataset"):
+    with pytest.raises(OffbenchError, match="is not recorded yet"):
         offbench.verify(medium)
     minari_store.root().mkdir()
     subprocess.run(["tar", "-xf", f"{home}/data.tar", "-C", str(minari_store.root())], check=True)
