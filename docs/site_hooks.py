@@ -2,6 +2,7 @@
 
 - Dataset cards (datasets/<env>/README.md) become pages below cards/.
 - Links to source files outside docs/ become plain text.
+- Equations (```math, as on GitHub) become MathML, which browsers draw without a script.
 """
 
 from __future__ import annotations
@@ -10,9 +11,11 @@ import re
 from pathlib import Path
 from typing import Any
 
+from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
+MATH = re.compile(r"^```math\n(.*?)^```$", re.M | re.S)
 LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
 
@@ -28,7 +31,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Rewrite links that lead out of docs/."""
+    """Rewrite links that lead out of docs/, and equations."""
 
     def rewrite(match: re.Match[str]) -> str:
         text, target, anchor = match[1], match[2], match[3] or ""
@@ -42,4 +45,10 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
             return text
         return f"[{text}]({target}{anchor})"
 
-    return LINK.sub(rewrite, markdown)
+    return MATH.sub(_equations, LINK.sub(rewrite, markdown))
+
+
+def _equations(match: re.Match[str]) -> str:
+    """Return one equation for each line of a block (`\\\\` at its end, as TeX has it)."""
+    lines = [line.strip().removesuffix("\\\\") for line in match[1].splitlines() if line.strip()]
+    return '<div style="overflow-x: auto">' + "".join(convert(line, display="block") for line in lines) + "</div>"

@@ -28,7 +28,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-LANGUAGES = ("sh", "python", "toml", "text", "bibtex", "slurm")
+LANGUAGES = ("sh", "python", "toml", "text", "bibtex", "slurm", "math")
 REASONS = (
     "CI itself runs it",
     "tests/test_packaging.py installs the wheel",

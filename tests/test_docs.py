@@ -14,6 +14,7 @@ import pytest
 import offbench
 from offbench.algorithm.interface import Algorithm, Batch, PolicyParts
 from offbench.rollouts.policy import ACTIVATIONS, KINDS
+from tests.browsers import chromium
 from tests.doc_blocks import (
     DOCS,
     LANGUAGES,
@@ -174,4 +175,34 @@ def test_the_site_builds_strictly(tmp_path: Path) -> None:
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "Hopper-v5 at three levels" in (tmp_path / "site" / "index.html").read_text()
+    equations = (tmp_path / "site" / "algorithms.html").read_text()
+    assert equations.count("<math ") == (DOCS / "algorithms.md").read_text().count("```math") > 10
+    assert "```" not in equations
+    assert "<mi>&" + "</mi>" not in equations  # what the converter leaves of TeX that it does not know
     assert 'id="offbench.collect"' in (tmp_path / "site" / "api.html").read_text()
+    _search_from_disk(tmp_path / "site")
+
+
+def _search_from_disk(site: Path) -> None:
+    """Search without a server, and ask no other one for anything."""
+    try:
+        with chromium() as browser:
+            page = browser.new_page(viewport={"width": 1360, "height": 900})
+            requests: list[str] = []
+            errors: list[str] = []
+            page.on("request", lambda request: requests.append(request.url))
+            page.on("pageerror", lambda error: errors.append(str(error)))
+            page.goto((site / "algorithms.html").as_uri())
+            page.click("input.md-search__input")
+            page.keyboard.type("discriminator")
+            page.wait_for_selector(".md-search-result__item")
+            assert "Algorithms" in page.locator(".md-search-result__item").all_inner_texts()[0]
+            page.keyboard.press("Escape")
+            page.locator("label[title='Switch to dark']").click()
+            assert page.get_attribute("body", "data-md-color-scheme") == "slate"
+            page.set_viewport_size({"width": 390, "height": 844})
+            assert page.evaluate("document.documentElement.scrollWidth") <= 390
+            assert not errors
+            assert all(url.startswith(("file:", "data:", "blob:", "about:")) for url in requests), requests
+    except (ImportError, FileNotFoundError) as missing:
+        pytest.skip(str(missing))
