@@ -45,10 +45,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
             return text
         return f"[{text}]({target}{anchor})"
 
-    return MATH.sub(_equations, LINK.sub(rewrite, markdown))
+    return MATH.sub(_equation, LINK.sub(rewrite, markdown))
 
 
-def _equations(match: re.Match[str]) -> str:
-    """Return one equation for each line of a block (`\\\\` at its end, as TeX has it)."""
-    lines = [line.strip().removesuffix("\\\\") for line in match[1].splitlines() if line.strip()]
-    return '<div style="overflow-x: auto">' + "".join(convert(line, display="block") for line in lines) + "</div>"
+def _equation(match: re.Match[str]) -> str:
+    return f'<div style="overflow-x: auto; margin: 1em 0">{convert(match[1].strip(), display="block")}</div>'
