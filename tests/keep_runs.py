@@ -1,32 +1,53 @@
-"""Keep the plain files of finished runs: `python -m tests.keep_runs RUNS docs/results/medium/runs`.
+"""Keep the plain files of finished runs: `python -m tests.keep_runs RUNS docs/results/medium/runs --steps 300000`.
 
-They are config.json, evaluations.csv and losses.csv, which is all that `offbench report --runs` reads.
+They are config.json, evaluations.csv and losses.csv, which is all that `offbench report --runs` reads. Of a run that was
+trained further than `--steps`, they are cut there: what a run does up to a step does not depend on its length.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import shutil
-import sys
 from pathlib import Path
 
-from offbench.training.run import find_runs
+from offbench.common.files import write_json
+from offbench.training.run import Run, find_runs
 
 FILES = ("config.json", "evaluations.csv", "losses.csv")
 
 
-def keep(runs: Path, place: Path) -> list[Path]:
-    """Copy each finished run's files below `place`; return the runs' folders there."""
-    kept = []
+def keep(runs: Path, target: Path, steps: int | None = None) -> list[Path]:
+    """Copy the files of each run that has reached `steps`, or its own last step, below `target`; return the copies.
+
+    Args:
+        steps: where to cut longer runs; they must have an evaluation there.
+    """
+    copies = []
     for run in find_runs(runs):
-        if run.finished(run.config().steps):
-            folder = place / run.folder.relative_to(runs)
-            folder.mkdir(parents=True, exist_ok=True)
-            for name in FILES:
-                shutil.copyfile(run.folder / name, folder / name)
-            kept.append(folder)
-    return kept
+        last = run.config().steps if steps is None else steps
+        if last not in run.evaluations() or run.diverged:
+            continue
+        copy = Run(target / run.folder.relative_to(runs))
+        copy.folder.mkdir(parents=True, exist_ok=True)
+        for name in FILES:
+            shutil.copyfile(run.folder / name, copy.folder / name)
+        if run.config().steps > last:
+            copy.write_evaluations({step: e for step, e in run.evaluations().items() if step <= last})
+            copy.write_losses([row for row in run.losses() if row["step"] <= last])
+            config = json.loads(copy.config_path.read_text(encoding="utf-8"))
+            if "sessions" in config:
+                config["sessions"] = [session for session in config["sessions"] if session["step"] < last]
+            write_json(copy.config_path, config | {"steps": last})
+        copies.append(copy.folder)
+    return copies
 
 
 if __name__ == "__main__":
-    for folder in keep(*map(Path, sys.argv[1:])):
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", type=Path)
+    parser.add_argument("target", type=Path)
+    parser.add_argument("--steps", type=int)
+    arguments = parser.parse_args()
+    for folder in keep(arguments.runs, arguments.target, arguments.steps):
         print(folder)
