@@ -22,7 +22,7 @@ import numpy as np
 
 from offbench.analysis.methods import Method, find_method, method_order, name_methods, rank
 from offbench.common.errors import OffbenchError, unknown
-from offbench.common.scores import mean_std, normalize, run_return, window
+from offbench.common.scores import LAST, mean_std, normalize, run_return, window
 from offbench.common.text import counted, printable
 from offbench.data.levels import LEVELS
 from offbench.training.run import DIGITS, Run, RunConfig, find_runs
@@ -30,6 +30,8 @@ from offbench.training.run import DIGITS, Run, RunConfig, find_runs
 # the order of the BDB paper's Table 1; levels are in its order already
 ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
 REFERENCES = {"dataset": "own reference", "d4rl": "D4RL's constants", None: "no reference: raw return"}
+
+LONG_CURVE = 40  # evaluations, of which more are drawn as means
 
 
 @dataclass(frozen=True)
@@ -164,6 +166,25 @@ class Entry:
         curves = [trained.curve(self.task.reference) for trained in self.runs]
         steps = sorted(set.intersection(*(set(curve) for curve in curves)))
         return steps, np.array([[curve[step] for step in steps] for curve in curves])
+
+    @property
+    def smoothed(self) -> bool:
+        """Whether a picture of the learning curve shows means of several evaluations."""
+        return len(self.common_curve()[0]) > LONG_CURVE
+
+    def drawn_curve(self) -> tuple[list[int], np.ndarray[Any, Any]]:
+        """Return the common curve as pictures show it.
+
+        Of more than LONG_CURVE evaluations, each point is the score that the runs would have if they ended there: the
+        mean of the last evaluations up to it.
+        """
+        steps, values = self.common_curve()
+        if not self.smoothed:
+            return steps, values
+        ends = np.arange(1, len(steps) + 1)
+        counts = np.minimum(ends, LAST)
+        sums = np.pad(values, ((0, 0), (1, 0))).cumsum(1)
+        return steps, (sums[:, ends] - sums[:, ends - counts]) / counts
 
 
 @dataclass(frozen=True)

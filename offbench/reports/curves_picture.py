@@ -20,9 +20,15 @@ def plot_curves(runs: str | Path, path: str | Path) -> Path:
     with figure(len(results.tasks)) as (fig, panels):
         for (task, method), entry in results.entries.items():
             axes = panels[results.tasks.index(task)]
-            steps, values = entry.common_curve()
+            steps, values = entry.drawn_curve()
             points = curve(values)
-            (line,) = axes.plot(steps, [p.value for p in points], marker="o", markersize=3, label=method.label)
+            (line,) = axes.plot(
+                steps,
+                [p.value for p in points],
+                marker="" if entry.smoothed else "o",
+                markersize=3,
+                label=method.label,
+            )
             if points and points[0].low is not None:
                 low, high = [p.low for p in points], [p.high for p in points]
                 axes.fill_between(steps, low, high, color=line.get_color(), alpha=0.15, linewidth=0)

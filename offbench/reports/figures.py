@@ -17,6 +17,7 @@ import numpy as np
 from offbench.analysis.methods import Method
 from offbench.analysis.results import REFERENCES, Entry, Results, Task
 from offbench.analysis.statistics import Estimate, Scores, curve, iqm, profile
+from offbench.common.scores import LAST
 from offbench.common.text import compact
 
 INK = "#21252b"  # text and axes; the page replaces it by its own text color
@@ -72,7 +73,7 @@ def curve_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
 
     def paint(axes: Any) -> None:
         for entry in entries:
-            steps, values = entry.common_curve()
+            steps, values = entry.drawn_curve()
             if steps:
                 points = curve(values)
                 _band(axes, steps, points, looks[entry.method])
@@ -82,7 +83,10 @@ def curve_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
     def alt() -> str:
         return f"Learning curves on {task.name}. At the last common evaluation: {', '.join(dict.fromkeys(ends))}."
 
-    return _draw(name, "Mean over seeds, 95% bootstrap interval shaded.", alt, paint, _legend(entries, looks))
+    caption = "Mean over seeds, 95% bootstrap interval shaded."
+    if any(entry.smoothed for entry in entries):
+        caption += f" Each point is the mean of the last {LAST} evaluations up to it."
+    return _draw(name, caption, alt, paint, _legend(entries, looks))
 
 
 def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str) -> Figure:
@@ -143,7 +147,7 @@ def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure |
     tasks = {task.name for task in results.tasks if task.reference}
     whole: dict[Method, tuple[list[int], dict[str, Any]]] = {}
     for method in results.methods:
-        curves = {e.task.name: e.common_curve() for e in results.of(method) if e.task.reference}
+        curves = {e.task.name: e.drawn_curve() for e in results.of(method) if e.task.reference}
         steps = sorted(set.intersection(*(set(curve[0]) for curve in curves.values()))) if curves else []
         if steps and curves.keys() == tasks:
             whole[method] = steps[:: max(1, len(steps) // 40)], curves
