@@ -20,6 +20,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
+from offbench.common.files import regular
 from offbench.rollouts.policy import ACTIVATIONS, Layers, Policy
 
 LARGEST = 2**30  # bytes of a member, unpacked
@@ -58,7 +59,7 @@ def _read(path: Path) -> tuple[dict[str, Array], dict[str, Any]]:
     """Return the tensors of policy.pth and the plain settings of data. Raises what zipfile and torch raise."""
     import torch
 
-    with zipfile.ZipFile(path) as archive:
+    with open(path, "rb", opener=regular) as file, zipfile.ZipFile(file) as archive:
         for name in ("policy.pth", "data"):
             if archive.getinfo(name).file_size > LARGEST:
                 raise ValueError(f"{name} is larger than {LARGEST:,} bytes")

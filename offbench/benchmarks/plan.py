@@ -57,6 +57,7 @@ class Benchmark:
 def prepare(
     grid: str,
     *,
+    env: str | None = None,
     runs: str | Path = "runs",
     device: str = "auto",
     workers: int | None = None,
@@ -67,6 +68,7 @@ def prepare(
 
     Args:
         grid: a shipped grid's name or a file (`./mine.toml`).
+        env: the recipe's name or file of the environment to evaluate in, instead of those that the datasets name.
         runs: the folder of all run folders.
         device, workers, stack, precision: as in `train`.
 
@@ -75,11 +77,12 @@ def prepare(
     """
     read = load_grid(grid)
     datasets = [source.id for source in read.datasets]
+    env_spec = load_recipe(env).env_spec() if env is not None else None
     variants = [
         variant
         for entry in read.entries
         for variant in specs_of(
-            entry.algorithm, entry.settings, datasets, entry.times, Path(runs), precision, label=entry.label
+            entry.algorithm, entry.settings, datasets, entry.times, Path(runs), precision, env_spec, label=entry.label
         )
     ]
     if len({(variant[0].algorithm, variant[0].variant) for variant in variants}) < len(variants):
@@ -116,7 +119,8 @@ class Plan:
         if not any(left):
             return
         env_specs = {source.env: _recipe(source).env_spec() for source in bench.grid.datasets if source.env}
-        env_specs = env_specs or {"": _recorded_env_spec(bench.grid.datasets[0])}
+        given = bench.variants[0][0].env_spec
+        env_specs = {"": given} if given else env_specs or {"": _recorded_env_spec(bench.grid.datasets[0])}
         env_spec = next(iter(env_specs.values()))  # for the shapes, which differ little
         play = float(np.mean([step_seconds(text) for text in env_specs.values()]))
         self._seconds = self._disk = self._products = 0.0
@@ -173,7 +177,7 @@ def _recipe(source: Source) -> Recipe:
 def _recorded_env_spec(source: Source) -> str:
     spec = evaluation_spec(minari_store.read_metadata(source.id))
     if spec is None:
-        raise OffbenchError(f"{source.id} names no environment; give its env in the grid")
+        raise OffbenchError(f"{source.id} names no environment: give one to evaluate in with --env RECIPE")
     believed_env(spec, source.id).close()
     return spec
 

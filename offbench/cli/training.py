@@ -34,10 +34,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     completed(argument, algorithm_names)
     dataset = parser.add_argument("--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets")
     completed(dataset, local_datasets)
-    env = parser.add_argument(
-        "--env", metavar="RECIPE", help="the environment to evaluate in (default: the one that the dataset names)"
-    )
-    completed(env, recipes)
+    _environment(parser)
     parser.add_argument(
         "--download", action="store_true", help="download datasets that are not here from Minari's server first"
     )
@@ -55,6 +52,8 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         parser.epilog = f"`offbench train ALGO --help` shows an algorithm's own settings.\n\n{parser.epilog}"
         parser.set_defaults(run=lambda **_: parser.error("name the algorithm first: offbench train ALGO --dataset ID"))
         return
+    moved = _moved(algorithm, words)
+    algorithm = "bdb_plus" if moved else algorithm
     parser.asked = f"offbench train {algorithm}"
     config = _settings(parser, algorithm)
 
@@ -65,6 +64,8 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
         rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
         rest["algorithm"], settings = algorithm, named | settings
+        if moved:
+            note(f"{moved} is an option of bdb_plus, no longer of bdb: training bdb_plus")
         folders = train(**rest, **settings, command=shlex.join(["offbench", "train", *words]))
         for folder in folders:
             print(folder)
@@ -77,6 +78,14 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
             hint("offbench", "evaluate", str(folders[0]), "--env", "RECIPE")
 
     parser.set_defaults(run=run)
+
+
+def _moved(algorithm: str, words: list[str]) -> str | None:
+    """Return the first flag that the algorithm had in earlier versions and bdb_plus has now; None if there is none."""
+    from offbench.training.registry import FORMER_SETTINGS
+
+    former = {f"--{name.replace('_', '-')}" for name in FORMER_SETTINGS.get(algorithm, {})}
+    return next((flag for flag in (word.partition("=")[0] for word in words) if flag in former), None)
 
 
 def _settings(parser: Parser, algorithm: str) -> type:
@@ -143,6 +152,13 @@ def _algorithm(words: list[str]) -> tuple[str | None, dict[str, Any]]:
     return None, {}
 
 
+def _environment(parser: Parser) -> None:
+    env = parser.add_argument(
+        "--env", metavar="RECIPE", help="the environment to evaluate in (default: the one that the dataset names)"
+    )
+    completed(env, recipes)
+
+
 def _machine(parser: Parser) -> None:
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
     parser.add_argument("--workers", type=whole, help="processes for training and evaluation (default: one per core)")
@@ -162,6 +178,7 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
 
     grid = parser.add_argument("grid", metavar="GRID", help=f"{', '.join(shipped_grids())}, or a grid file")
     completed(grid, shipped_grids)
+    _environment(parser)
     parser.add_argument("--plan", action="store_true", help="print the runs, their cost and disk space, and exit")
     parser.add_argument("--budget", metavar="TIME", help="stop after this time with checkpoints: 90s, 9m or 2h")
     parser.add_argument("--shard", type=share, default=(0, 1), metavar="I/N", help="run share I of N, counted from 0")

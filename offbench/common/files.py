@@ -155,10 +155,10 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=1, sort_keys=False, allow_nan=False) + "\n").encode())
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file. Raises OffbenchError if it is missing or damaged."""
+def read_json(path: Path, remedy: str = "delete it to start over") -> Any:
+    """Read a JSON file. Raises OffbenchError if it is missing or damaged (the `remedy` says what to do then)."""
     try:
-        with damage(str(path), "is damaged or not JSON", "delete it to start over"):
+        with damage(str(path), "is damaged or not JSON", remedy):
             value = json.loads(read_text(path))
             json.dumps(value, ensure_ascii=False).encode()  # "\\ud800" is JSON, but cannot be printed or written
             return value
@@ -226,7 +226,7 @@ def regular(path: str | Path, flags: int = os.O_RDONLY) -> int:
     descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise OSError("not a regular file")
+        raise OSError(f"{path} is not a regular file")
     return descriptor
 
 

@@ -28,7 +28,7 @@ from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.progress import Progress
 from offbench.data import minari_store
 from offbench.data.file_stamps import unchanged
-from offbench.data.minari_reader import episodes_of, open_minari, reading
+from offbench.data.minari_reader import episodes_of, finite, flags, float32, open_minari, reading
 from offbench.envs.environments import box
 
 FORMATS = {"d4rl": (".hdf5", ".h5"), "npz": (".npz",)}  # and how their files end
@@ -86,7 +86,7 @@ def _write(dataset_id: str, path: Path, style: str, drop_timeouts: bool) -> None
             _write_d4rl(path, columns, _about(data, metadata))
         else:
             dropped = minari_store.provenance(metadata).get("timeouts") == "dropped"
-            _write_npz(path, (_float32(part) for part in columns), drop_timeouts, dropped)
+            _write_npz(path, (_float32(part, dataset_id) for part in columns), drop_timeouts, dropped)
 
 
 def _style(out: Path, style: str | None) -> str:
@@ -106,14 +106,17 @@ def _columns(data: Any, dataset_id: str, progress: Progress) -> Iterator[Columns
     for e in episodes_of(data):
         steps = len(e)
         shapes = [array.shape[:1] for array in e.arrays]
-        if not steps or shapes != [(steps + 1,)] + [(steps,)] * 4 or e.actions.ndim != 2 or e.observations.ndim != 2:
+        dimensions = [array.ndim for array in e.arrays]
+        if not steps or shapes != [(steps + 1,)] + [(steps,)] * 4 or dimensions != [2, 2, 1, 1, 1]:
             raise OffbenchError(f"{dataset_id}, episode {e.index}: its arrays do not fit; see `offbench verify`")
+        for name in ("observations", "actions", "rewards"):
+            finite(getattr(e, name), f"{dataset_id}, episode {e.index}: {name}")
         yield {
             "observations": e.observations[:-1],
             "actions": e.actions,
             "rewards": e.rewards,
-            "terminals": e.terminations.astype(bool),
-            "timeouts": e.truncations.astype(bool),
+            "terminals": flags(e.terminations, f"{dataset_id}, episode {e.index}: terminations"),
+            "timeouts": flags(e.truncations, f"{dataset_id}, episode {e.index}: truncations"),
             "next_observations": e.observations[1:],
             **seeds(e.seed, steps),
         }
@@ -180,10 +183,10 @@ def _joined(parts: list[Columns]) -> Columns:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _float32(part: Columns) -> Columns:
+def _float32(part: Columns, dataset_id: str) -> Columns:
     """Return what qlearning_dataset has of an episode: float32 numbers, boolean flags."""
     numbers = ("observations", "actions", "rewards", "next_observations")
-    floats: Columns = {name: part[name].astype(np.float32) for name in numbers}
+    floats: Columns = {name: float32(part[name], f"{dataset_id}: {name}") for name in numbers}
     return floats | {name: part[name] for name in ("terminals", "timeouts")}
 
 

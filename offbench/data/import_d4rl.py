@@ -33,6 +33,7 @@ from offbench.common.progress import Progress
 from offbench.common.provenance import versions
 from offbench.data import minari_store
 from offbench.data.d4rl_file import NUMBERS, SEEDS, Source, read_source
+from offbench.data.minari_reader import flags
 from offbench.envs.environments import box, make_env, time_limit
 from offbench.envs.margin_rule import ADDED, MARGIN, without_margin
 from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference, load_recipe, names
@@ -177,10 +178,10 @@ def _ends(source: Source, origin: _Origin) -> dict[int, tuple[bool, bool]]:
     flags say: it is truncated.
     """
     count, complete = len(source), "next_observations" in source.columns
-    terminals = source.read("terminals", 0, count).astype(bool)
+    terminals = flags(source.read("terminals", 0, count), f"{source.path}: terminals")
     timeouts = np.zeros(count, bool)
     if "timeouts" in source.columns:
-        timeouts |= source.read("timeouts", 0, count).astype(bool)
+        timeouts |= flags(source.read("timeouts", 0, count), f"{source.path}: timeouts")
     stops = terminals | (_broken(source) if complete else timeouts)
     if "timeouts" not in source.columns:
         stops[-1] = True

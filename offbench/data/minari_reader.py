@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -13,20 +15,26 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError
-from offbench.common.files import damage
+from offbench.common.files import damage, regular
 from offbench.data import minari_store
 
 AGAIN = "record or download it again"
+LARGEST = float(np.finfo(np.float32).max)
 
 
-def reading(dataset_id: str) -> contextlib.AbstractContextManager[None]:
+@contextlib.contextmanager
+def reading(dataset_id: str) -> Iterator[None]:
     """Read a dataset within this context.
 
     Raises:
         DamagedError: its content is at fault.
         OffbenchError: its files are locked, may not be read, or need a package that is not installed.
     """
-    return damage(dataset_id, "is damaged", AGAIN)
+    try:
+        with damage(dataset_id, "is damaged", AGAIN):
+            yield
+    except FileNotFoundError as error:
+        raise DamagedError(f"{dataset_id} is damaged (there is no {error.filename or error}); {AGAIN}") from error
 
 
 @dataclass(frozen=True)
@@ -79,11 +87,23 @@ def open_minari(dataset_id: str) -> Any:
 
 def check_storage(dataset_id: str) -> None:
     """Refuse HDF5 files whose arrays lie elsewhere: HDF5 would follow them to any file of this machine."""
-    for path in sorted((minari_store.path_of(dataset_id) / "data").rglob("*.hdf5")):
+    for path in _files(dataset_id):
+        if path.suffix != ".hdf5":
+            continue
         with reading(dataset_id), h5py.File(path) as file:
             elsewhere = _elsewhere(file)
         if elsewhere:
             raise DamagedError(f"{dataset_id} is not read: {elsewhere} is not data of {path}; get it from its source")
+
+
+def _files(dataset_id: str) -> list[Path]:
+    """Return the files of a dataset. Raises DamagedError if one is not a regular file: it could block."""
+    paths = sorted((minari_store.path_of(dataset_id) / "data").rglob("*"))
+    found = [path for path in paths if not path.is_dir() or path.suffix == ".hdf5"]
+    with reading(dataset_id):
+        for path in found:
+            os.close(regular(path))
+    return found
 
 
 def _elsewhere(file: h5py.File) -> str | None:
@@ -109,9 +129,7 @@ def open_parsed(dataset_id: str) -> Any:
     if "observation_space" not in metadata or "action_space" not in metadata:
         # Minari would make the environment to ask it, running whatever code the file names
         raise DamagedError(f"{dataset_id} is damaged (its metadata lack a space); {AGAIN}")
-    size = sum(
-        path.stat().st_size for path in (minari_store.root() / dataset_id / "data").rglob("*") if path.is_file()
-    )
+    size = sum(path.stat().st_size for path in _files(dataset_id))
     if not 0 <= (metadata.get("total_episodes") or 0) <= size:
         raise DamagedError(f"{dataset_id} is damaged (its files are too small for its episodes); {AGAIN}")
     with warnings.catch_warnings():
@@ -128,3 +146,27 @@ def open_parsed(dataset_id: str) -> Any:
                 raise OffbenchError(f"cannot read {dataset_id}: {words}; install another version of minari") from error
             int(data.total_steps)  # Minari reads it from the metadata when it is asked for
             return data
+
+
+def finite(array: Array, what: str) -> Array:
+    """Return finite real numbers as they are. Raises OffbenchError if they are anything else."""
+    if array.dtype.kind not in "fiub":
+        raise OffbenchError(f"{what} are {array.dtype}, not numbers; the dataset is damaged")
+    if not np.isfinite(array).all():
+        raise OffbenchError(f"{what} hold NaN or infinite numbers; filter them out of the dataset")
+    return array
+
+
+def float32(array: Array, what: str) -> Array:
+    """Return finite numbers as float32. Raises OffbenchError if they are anything else, or too large for float32."""
+    largest = float(np.abs(finite(array, what)).max(initial=0))
+    if largest > LARGEST:
+        raise OffbenchError(f"{what} reach {largest:.3g}, beyond float32's {LARGEST:.2g}; scale them in the dataset")
+    return np.asarray(array, np.float32)
+
+
+def flags(array: Array, what: str) -> Array:
+    """Return zeros and ones as booleans. Raises OffbenchError if there is any other value."""
+    if not np.isin(finite(array, what), (0, 1)).all():
+        raise OffbenchError(f"{what} hold values other than 0 and 1; the dataset is damaged")
+    return array.astype(bool)

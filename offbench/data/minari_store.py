@@ -124,11 +124,12 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
     path = root() / dataset_id / "data" / "metadata.json"
     if not exists(dataset_id):
         raise _absent(dataset_id)
-    metadata = read_json(path)
+    remedy = "record or download the dataset again"
+    metadata = read_json(path, remedy)
     try:
         _check_metadata(metadata)
     except (ValueError, TypeError, RecursionError) as error:
-        raise DamagedError(f"{path} is damaged: {error}; record or download the dataset again") from None
+        raise DamagedError(f"{path} is damaged: {error}; {remedy}") from None
     return dict(metadata)
 
 

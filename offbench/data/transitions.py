@@ -31,14 +31,13 @@ from offbench.common.files import disk_errors, read_text, write_json
 from offbench.common.progress import Progress
 from offbench.data import minari_store
 from offbench.data.file_stamps import ReplacedError, Stamps, checked, recorded, unchanged
-from offbench.data.minari_reader import check_storage, open_parsed, reading
+from offbench.data.minari_reader import check_storage, flags, float32, open_parsed, reading
 from offbench.data.recorded_env import evaluation_spec
 from offbench.envs.environments import action_box, box, same_environment
 
 ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
 ATTEMPTS = 3  # to read a dataset that is replaced meanwhile
 NUMBERS = ("observations", "actions", "rewards")
-LARGEST = float(np.finfo(np.float32).max)
 LEAST_USED = 1e-3  # of the range between the action bounds
 CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding are worth a warning
 
@@ -286,21 +285,9 @@ def _episode_arrays(
         actual = np.shape(getattr(episode, name))
         if actual != shape or not steps:
             raise OffbenchError(f"{where}: {name} have shape {actual}, expected {shape}; the dataset is damaged")
-    flat = {name: _float32(np.asarray(getattr(episode, name)), f"{where}: {name}") for name in NUMBERS}
-    flat["masks"] = 1.0 - np.asarray(episode.terminations, np.float32)
+    flat = {name: float32(np.asarray(getattr(episode, name)), f"{where}: {name}") for name in NUMBERS}
+    flat["masks"] = 1.0 - flags(np.asarray(episode.terminations), f"{where}: terminations").astype(np.float32)
     return flat
-
-
-def _float32(array: Array, what: str) -> Array:
-    """Return finite numbers as float32. Raises OffbenchError if some are not finite, or too large for float32."""
-    if array.dtype.kind not in "fiub":
-        raise OffbenchError(f"{what} are {array.dtype}, not numbers; the dataset is damaged")
-    if not np.isfinite(array).all():
-        raise OffbenchError(f"{what} hold NaN or infinite numbers; filter them out of the dataset")
-    largest = float(np.abs(array).max(initial=0))
-    if largest > LARGEST:
-        raise OffbenchError(f"{what} reach {largest:.3g}, beyond float32's {LARGEST:.2g}; scale them in the dataset")
-    return np.asarray(array, np.float32)
 
 
 def _scaled(actions: Array, space: gym.spaces.Box, dataset_id: str) -> Array:

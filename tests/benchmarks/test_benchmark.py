@@ -143,6 +143,17 @@ def test_missing_datasets_are_recorded_first(home: Path) -> None:
     assert minari_store.read_metadata("mine-v0")["total_steps"] == 500
 
 
+def test_datasets_without_an_environment_are_evaluated_where_env_says(grid: str, home: Path) -> None:
+    (dataset,) = load_grid(grid).datasets
+    path = minari_store.path_of(dataset.id) / "data" / "metadata.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"env_spec": None, "eval_env_spec": None}))
+    with pytest.raises(OffbenchError, match=f"{dataset.id} names no environment: .*--env RECIPE"):
+        benchmark(prepare(grid, workers=1), say=silent)
+    main(["benchmark", grid, "--workers", "1", "--env", "inverted-pendulum"])
+    assert [run.config().env_id for run in find_runs(home / "runs")] == ["InvertedPendulum-v5"] * 4
+    assert all(run.evaluations() for run in find_runs(home / "runs"))
+
+
 def test_a_budget_stops_cleanly_and_the_same_call_goes_on(grid: str) -> None:
     assert not benchmark(prepare(grid, workers=1), budget="0.001s", say=silent)
     assert benchmark(prepare(grid, workers=1), budget="1h", say=silent)

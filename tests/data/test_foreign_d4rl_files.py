@@ -68,6 +68,20 @@ def test_without_a_limit_or_timeouts_nothing_can_be_cut(
     assert lengths("p-v0") == [50]
 
 
+@pytest.mark.parametrize("name", ["terminals", "timeouts"])
+@pytest.mark.parametrize(("flag", "right"), [(0.5, False), (2, False), (np.nan, False), (1.0, True)])
+def test_flags_are_zeros_and_ones(name: str, flag: float, right: bool, home: Path, rng: np.random.Generator) -> None:
+    columns = still(20, rng) | {"terminals": np.zeros(20), "timeouts": np.zeros(20)}
+    columns[name][9] = flag
+    write(home / "local.hdf5", **columns)
+    if right:
+        import_d4rl(home / "local.hdf5", "p-v0", env="inverted-pendulum")
+        assert lengths("p-v0") == [10 if name == "terminals" else 9, 9]  # no next observation at a cut
+    else:
+        with pytest.raises(OffbenchError, match=f"{name} hold (values other than 0 and 1|NaN)"):
+            import_d4rl(home / "local.hdf5", "p-v0", env="inverted-pendulum")
+
+
 @pytest.mark.parametrize("kinds", [("<f4", "<f8"), ("<f8", "<f4"), ("<f8", "<f2"), (">f4", "<f8")])
 def test_next_observations_are_compared_in_one_precision(
     kinds: tuple[str, str], home: Path, rng: np.random.Generator

@@ -115,6 +115,56 @@ BAD = {
 }
 
 
+def planted(name: str, rows: str, values: Any) -> str:
+    """Put rows of another kind into a dataset's first episode, of three steps."""
+    foreign(name, [episode(3, 0, True)])
+    with h5py.File(minari_store.path_of(name) / "data" / "main_data.hdf5", "a") as file:
+        del file[f"episode_0/{rows}"]
+        file[f"episode_0/{rows}"] = values
+    return name
+
+
+@pytest.mark.parametrize(
+    ("rows", "values", "message"),
+    [
+        ("terminations", np.array([0, 0, 0.5]), "terminations hold values other than 0 and 1"),
+        ("terminations", np.array([0, 0, 7]), "terminations hold values other than 0 and 1"),
+        ("terminations", np.array([0, 0, np.nan]), "terminations hold NaN"),
+        ("rewards", np.zeros(3, complex), "rewards are complex128, not numbers"),
+        ("rewards", np.zeros(3, [("a", float)]), "rewards are .*, not numbers"),
+        ("rewards", np.array([b"a", b"b", b"c"]), r"rewards are .*, not numbers"),
+        ("rewards", np.zeros((3, 1)), r"shape \(3, 1\), expected|do not fit"),
+        ("rewards", np.array([0, np.nan, 1]), "rewards hold NaN"),
+    ],
+)
+def test_rows_of_another_kind_are_neither_trained_on_nor_exported(
+    rows: str, values: Any, message: str, home: Path
+) -> None:
+    name = planted("kinds-v0", rows, values)
+    with pytest.raises(OffbenchError, match=message):
+        offbench.load(name)
+    for file in ("out.hdf5", "out.npz"):
+        with pytest.raises(OffbenchError, match=message):
+            offbench.export(name, file)
+        assert not (home / file).exists()
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.float32, np.uint8])
+def test_flags_that_are_numbers_count_as_flags(kind: Any) -> None:
+    name = planted("numbers-v0", "terminations", np.array([0, 0, 1], kind))
+    np.testing.assert_array_equal(offbench.load(name).masks, [1, 1, 0])
+    np.testing.assert_array_equal(np.load(offbench.export(name, "out.npz"))["terminals"], [False, False, True])
+
+
+def test_an_export_does_not_round_numbers_to_infinity(home: Path) -> None:
+    foreign("large-v0", [episode(3, 0, True, rewards=np.array([0, 1e39, 0]))])
+    with pytest.raises(OffbenchError, match=r"rewards reach 1e\+39, beyond float32"):
+        offbench.export("large-v0", "out.npz")
+    offbench.export("large-v0", "out.hdf5")
+    with h5py.File(home / "out.hdf5") as file:
+        assert file["rewards"][1] == 1e39  # of the same precision as the dataset
+
+
 @pytest.mark.parametrize("kind", BAD)
 def test_bad_data_are_refused(kind: str) -> None:
     episodes, message = BAD[kind]

@@ -75,6 +75,23 @@ def test_data_in_another_file_are_not_read(
             read(recorded)
 
 
+@pytest.mark.parametrize("place", ["a FIFO", "a broken link", "a folder"])
+def test_what_is_no_file_is_neither_waited_for_nor_read(recorded: str, home: Path, place: str) -> None:
+    path = home / "minari" / recorded / "data" / "main_data.hdf5"
+    path.unlink()
+    if place == "a FIFO":
+        os.mkfifo(path)
+    elif place == "a folder":
+        path.mkdir()
+    else:
+        path.symlink_to("/nowhere")
+    for read in (transitions.load, open_minari, lambda name: offbench.export(name, "out.npz")):
+        with pytest.raises(
+            offbench.OffbenchError, match=r"is damaged .*main_data\.hdf5.*; record or download it again"
+        ):
+            read(recorded)
+
+
 def test_data_other_than_the_recorded_hash_are_refused(recorded: str, home: Path) -> None:
     with h5py.File(home / "minari" / recorded / "data" / "main_data.hdf5", "a") as file:
         file[REWARDS][0] += 1

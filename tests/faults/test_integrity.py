@@ -182,10 +182,11 @@ def test_no_cell_is_a_formula(cell: str) -> None:
 
 def test_a_fifo_is_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It would be waited for without end."""
-    for name in ("grid.toml", "recipe.toml", "policy.safetensors"):
+    for name in ("grid.toml", "recipe.toml", "policy.safetensors", "ppo.zip"):
         os.mkfifo(tmp_path / name)
-    for words in (["benchmark", "grid.toml"], ["collect", "recipe.toml"], ["evaluate", "policy.safetensors"]):
-        line = refusal([words[0], str(tmp_path / words[1])], capsys)
+    names = {"benchmark": "grid.toml", "collect": "recipe.toml", "evaluate": "policy.safetensors"}
+    for words in (*names.items(), ("collect inverted-pendulum --name x --policy", "ppo.zip")):
+        line = refusal([*words[0].split(), str(tmp_path / words[1])], capsys)
         assert words[1] in line
         assert "not a regular file" in line
 

@@ -161,6 +161,13 @@ def test_metadata_of_another_kind_are_one_line(house: str, changes: dict[str, An
         assert isinstance(error.value, DamagedError) == ("damaged" in cause)
 
 
+def test_metadata_that_are_no_json_are_not_to_be_deleted(house: str) -> None:
+    (minari_store.path_of(house) / "data" / "metadata.json").write_text("{")
+    for name in ("load", "show", "export"):
+        with pytest.raises(DamagedError, match=r"not JSON .*; record or download the dataset again"):
+            attempts(house)[name]()
+
+
 def test_an_id_in_the_metadata_that_is_none_stops_no_export(house: str) -> None:
     path = minari_store.path_of(house) / "data" / "metadata.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"dataset_id": "house"}))

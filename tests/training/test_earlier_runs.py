@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import offbench
+from offbench.cli.main import main
 from offbench.common.provenance import hardware
 from offbench.rollouts.policy import load_policy
 from offbench.training.run import find_runs
@@ -57,3 +58,14 @@ def test_earlier_runs_are_reported(home: Path) -> None:
     assert {row["algorithm"] for row in rows} == set(SETTINGS)
     assert all(row["steps"] == 20 and row["evaluations"] == 1 for row in rows)
     assert len(find_runs(home / "runs")) == len(SETTINGS)
+
+
+def test_options_that_bdb_had_train_bdb_plus(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(EARLIER / "minari", home / "minari")
+    words = "train bdb --dataset pendulum-small-v0 --steps 4 --eval-every 2 --eval-episodes 1 --hidden 8,8 --workers 1"
+    main([*words.split(), "--beta", "adaptive", "--uncertainty", "relative", "--beta-max=0.5"])
+    assert "--uncertainty is an option of bdb_plus, no longer of bdb" in capsys.readouterr().err
+    (run,) = find_runs(home / "runs")
+    config = run.config()
+    assert config.algorithm == "bdb_plus"
+    assert {"beta": "adaptive", "uncertainty": "relative", "beta_max": 0.5}.items() <= config.settings.items()
