@@ -77,13 +77,14 @@ class Comparison:
         """Return the comparison as text."""
         statistics = self.statistics
         effect = "-" if statistics.standardized is None else f"{statistics.standardized:+.2f}"
+        pairs = counted(statistics.pairs, "paired difference")
         percent = self.chance.percent()
         lines = [f"{self.a} against {self.b} ({self.reference})", ""]
         lines += [
             *self._pair_lines(),
             "",
             f"mean difference             {statistics.difference.value:+.1f} {statistics.difference.span()}".rstrip(),
-            f"standardized                {effect} (over the deviation of the {statistics.pairs} paired differences)",
+            f"standardized                {effect} (over the deviation of {pairs})",
             f"probability of improvement  {percent.value:.0f}% {percent.span()}".rstrip(),
             f"sign-flip test              p = {statistics.p:.3g}",
         ]

@@ -49,7 +49,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
             ["export hopper-medium-v0 --out hopper-medium.hdf5"],
         ),
         "card": Command(
-            "write the dataset card of an environment, or of a dataset for Hugging Face",
+            "write an environment's card, or a dataset's for Hugging Face",
             data.card_arguments,
             ["card hopper", "card hopper-medium-v0 --huggingface"],
         ),

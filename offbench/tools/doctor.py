@@ -38,6 +38,8 @@ EXTRAS = {  # module: what it is for
     "tensorboard": "offbench train --tensorboard",
     "wandb": "offbench train --wandb",
     "imageio_ffmpeg": "offbench video to .mp4",
+    "onnx": "offbench export-policy to .onnx",
+    "huggingface_hub": "offbench train --download",
 }
 
 

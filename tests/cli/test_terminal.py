@@ -63,6 +63,15 @@ def test_the_score_table_fits(screen: Callable[..., str], home: Path, columns: i
     assert ("evals" in plain) == (columns > 60)  # what gives way first
 
 
+@pytest.mark.parametrize("columns", [80, 120])
+def test_the_table_of_runs_fits(screen: Callable[..., str], home: Path, columns: int) -> None:
+    made_grid(home / "runs", envs=("halfcheetah",), seeds=2, levels=4)
+    plain = COLOR.sub("", screen(columns, "list", "runs"))
+    assert max(map(len, plain.splitlines())) <= columns
+    assert plain.count("halfcheetah-medium-expert-v0") == 1  # a heading above its runs
+    assert plain.count("finished") == 4 * 6 * 2
+
+
 def test_no_color_where_it_is_not_wanted(screen: Callable[..., str], home: Path) -> None:
     for words in (["--help"], ["train", "--help"], ["list"], ["show", "nothing-v0"]):
         assert COLOR.search(screen(80, *words)), words
