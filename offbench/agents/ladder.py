@@ -122,7 +122,7 @@ def read_ladder(folder: Path) -> Ladder | None:
         if gone := [rung.policy for rung in rungs if not (folder / "policies" / rung.policy).is_file()]:
             raise ValueError(f"it lacks policies/{gone[0]}")
         if not isinstance(info.get("versions", {}), dict):
-            raise ValueError("its versions are no table")
+            raise ValueError("its versions are not a table")
     return ladder
 
 

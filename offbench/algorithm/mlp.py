@@ -5,10 +5,10 @@
 
 On a GPU a layer of all perceptrons is one batched product, and autograd computes the gradients (`stacked`).
 
-On a CPU one perceptron goes after the other, so that its arrays stay in the cache, and its passes are written out
-(`Pass`): buffers are kept between calls, products are NumPy's (OpenBLAS writes into them), and only gradients that
-somebody asks for are computed. A layer's weights and bias lie one after the other, so they are one matrix, and
-the inputs of each layer have a last column of ones:
+On a CPU perceptrons are computed one after the other, so that their arrays stay in the cache, and the passes are
+written out (`Pass`): buffers are kept between calls, NumPy (OpenBLAS) writes products into them, and unused gradients
+are not computed. A layer's weights and bias are adjacent in memory, so they are one matrix, and the inputs of each
+layer have a last column of ones:
 
     [h | 1] [batch, in + 1]  @  [W; b] [in + 1, out]          one product gives h W + b,
     [h | 1].T @ gradient                                      and one the gradients of W and b
@@ -176,7 +176,7 @@ class PassBack:
     """The backward pass of a forward pass.
 
     Attributes:
-        of_flat, of_inputs: the gradients; None where nobody needs them.
+        of_flat, of_inputs: the gradients; None where not needed.
     """
 
     def __init__(

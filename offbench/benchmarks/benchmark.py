@@ -102,7 +102,7 @@ def _seconds(text: str) -> float:
     except (ValueError, KeyError, IndexError):
         raise OffbenchError(f"a budget is a time like 9m, 1.5h or 90s, not {text!r}") from None
     if not 0 < value < float("inf"):
-        raise OffbenchError(f"a budget must be more than nothing, not {text!r}")
+        raise OffbenchError(f"a budget must be positive, not {text!r}")
     return value
 
 

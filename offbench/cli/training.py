@@ -45,7 +45,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     parser.add_argument("--eval-every", type=whole, default=5_000, help="updates between evaluations (default: 5,000)")
     parser.add_argument("--eval-episodes", type=whole, default=10, help="episodes per evaluation (default: 10)")
     _machine(parser)
-    parser.add_argument("--fresh", action="store_true", help="delete what the run folders hold and train anew")
+    parser.add_argument("--fresh", action="store_true", help="delete what the run folders hold and train again")
     parser.add_argument("--tensorboard", action="store_true", help="write event files into each run's folder")
     parser.add_argument("--wandb", metavar="PROJECT", help="log to a Weights & Biases project")
     if algorithm is None:

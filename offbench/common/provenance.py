@@ -33,7 +33,7 @@ def hardware() -> dict[str, Any]:
 
 
 def made_with(device: str, precision: str) -> dict[str, Any]:
-    """Return what a run's numbers depend on beside its settings and seed: a `Session` of its config.json."""
+    """Return what a run's numbers depend on in addition to settings and seed: a `Session` of its config.json."""
     made = hardware()
     if device != "cpu":
         import torch

@@ -42,7 +42,7 @@ _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2
 
 
 def printable(text: str) -> str:
-    r"""Return text of a file as a terminal may show it: escape sequences are spelled out, as in `\x1b[2J`."""
+    r"""Return text of a file as a terminal may show it: control characters are escaped, as in `\x1b[2J`."""
     return _CONTROLS.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
 
 

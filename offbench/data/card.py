@@ -4,8 +4,8 @@
     README.md   the same to read, with references, rungs and provenance
     card.png    the learning curve and the histogram of returns of each level
 
-`collect` compares what it records at full size with the shipped card.json, so that everybody knows whether
-they hold the same data.
+`collect` compares the content hash of a level that it records at full size with the shipped card.json, and prints
+whether the data are the same.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from offbench.data.levels import LEVELS, full_size
 from offbench.data.show import Summary, show
 from offbench.envs.recipes import Recipe, load_recipe
 
-DECIDE = ("mujoco", "gymnasium", "numpy")  # the packages whose versions can change what is recorded
+DECIDE = ("mujoco", "gymnasium", "numpy")  # packages whose version can change the recorded data
 BINS = 50
 BLUE, RED = "#3b6ea5", "#c4443c"
 
@@ -47,14 +47,14 @@ def card(env: str, out: str | Path | None = None, behaviour_dir: str | Path = BE
         The folder.
 
     Raises:
-        OffbenchError: a level is missing or was recorded otherwise, or there is no ladder.
+        OffbenchError: a level is missing or was recorded with other settings, or there is no ladder.
     """
     recipe = load_recipe(env)
     ladder = find_ladder(recipe, Path(behaviour_dir))
     if ladder is None:
         raise OffbenchError(
-            f"{recipe.name} has no ladder to describe, shipped or in {behaviour_dir}; "
-            f"build one with `offbench behaviour {shlex.quote(env)}`, or give its --behaviour-dir"
+            f"{recipe.name} has no ladder: none is shipped, and there is none in {behaviour_dir}; "
+            f"train one with `offbench behaviour {shlex.quote(env)}`, or pass its folder as --behaviour-dir"
         )
     own = [] if Path(behaviour_dir) == Path(BEHAVIOUR) else ["--behaviour-dir", str(behaviour_dir)]
     collect = shlex.join(["offbench", "collect", env, *own])
@@ -73,9 +73,9 @@ def card(env: str, out: str | Path | None = None, behaviour_dir: str | Path = BE
 
 
 def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
-    """Return a line that says whether a level recorded at full size is the one on the shipped card.
+    """Return a line that says whether a level recorded at full size has the content on the shipped card.
 
-    None where the card says nothing of it: no card, or a level that is not one of the five.
+    None if there is no card, or if the level is not one of the five.
     """
     path = recipe.folder / "card.json" if recipe.folder else None
     if path is None or not path.exists():
@@ -89,14 +89,18 @@ def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
     here = versions()["mujoco"]
     made = card["versions"] | {"mujoco": here if here in contents else next(iter(contents))}
     others = [f"{name} {version}" for name, version in made.items() if versions()[name] != version]
-    reason = f"made with {', '.join(others)}" if others else "made with the same versions: another processor or libm?"
+    reason = (
+        f"which was made with {', '.join(others)}"
+        if others
+        else "although the versions are the same (a different processor or C library?)"
+    )
     return f"warning: content differs from the dataset card's, {reason}"
 
 
 def _keep_hashes(recipe: Recipe, facts: dict[str, dict[str, Any]], mujoco: str) -> None:
-    """Add to each level the content hashes that the shipped card has of other MuJoCo versions.
+    """Add the shipped card's content hashes of other MuJoCo versions to each level, if it describes the same ladder.
 
-    Its replay is what tells whether the shipped card is of the same ladder: no simulator has a part in it.
+    medium-replay tells that: it comes from training, so its content is the same on every MuJoCo version.
     """
     path = recipe.folder / "card.json" if recipe.folder else None
     shipped = read_json(path)["levels"] if path is not None and path.exists() else {}
@@ -109,7 +113,7 @@ def _keep_hashes(recipe: Recipe, facts: dict[str, dict[str, Any]], mujoco: str) 
 
 
 def _recorded(recipe: Recipe, ladder: Ladder, level: str, collect: str) -> Summary:
-    """Return a recorded level, checked to be what the card claims. `collect` is the command that records it."""
+    """Return a recorded level after checking its seed, size and references. `collect` is the command to record it."""
     dataset_id = f"{recipe.name}-{level}-v{recipe.version}"
     if dataset_id not in minari_store.local_ids():
         raise OffbenchError(f"{dataset_id} is not recorded yet; first `{collect} --level {level}`")
@@ -122,7 +126,7 @@ def _recorded(recipe: Recipe, ladder: Ladder, level: str, collect: str) -> Summa
     same = ours.get("references") == ladder.info["references"] and ours.get("seed") == 0
     if not same or int(summary.lengths.sum()) != size:
         raise OffbenchError(
-            f"{dataset_id} is not the level that is shipped (seed 0, {size:,.0f} transitions, this ladder); "
+            f"{dataset_id} does not match the card (seed 0, {size:,.0f} transitions, the references of this ladder); "
             f"record it with `{collect} --level {level} --overwrite`"
         )
     return summary
@@ -151,12 +155,21 @@ def _facts(recipe: Recipe, summary: Summary) -> dict[str, Any]:
 def _text(recipe: Recipe, ladder: Ladder, facts: Mapping[str, Any], made: Mapping[str, str]) -> Iterator[str]:
     info, references = ladder.info, ladder.info["references"]
     yield f"# {recipe.name}: {recipe.env_id}"
-    yield from ("", f"Made by `offbench card {recipe.name}`; the same numbers for programs: `card.json`.", "")
+    command = f"`offbench card {recipe.name}`"
+    yield from (
+        "",
+        f"Generated by {command}. [card.json](card.json) has the same numbers in machine-readable form.",
+        "",
+    )
     yield from ("![Learning curve of the behaviour agent; returns of each level](card.png)", "", "## Levels", "")
     header = ["level", "transitions", "episodes", "mean return", "std", "min", "max"]
     header += ["score (own ref.)", "score (D4RL ref.)", "episodes terminated"]
     yield from markdown(header, [_cells(level, values) for level, values in facts.items()])
-    yield from ("", "Returns are per episode; std over episodes. An episode that the level's size cuts is truncated.")
+    yield ""
+    yield (
+        "Returns are per episode; std is the standard deviation over episodes. An episode cut off at the level's size "
+        "is truncated."
+    )
     yield from ("", "## References", "")
     yield from markdown(
         ["policy", "score", "mean return", "95% interval", "episodes"],
@@ -167,20 +180,21 @@ def _text(recipe: Recipe, ladder: Ladder, facts: Mapping[str, Any], made: Mappin
     )
     yield from ("", "## Behaviour agent", "")
     sac, where = info["sac"], info["hardware"]
-    links = f"every rung: `{ladder.folder}`"
+    links = f"all saved policies: `{ladder.folder}`"
     if recipe.folder:
         rungs = "[behaviour/ladder.csv](behaviour/ladder.csv)"
-        links = f"settings and why: [recipe.toml](recipe.toml); every rung: {rungs}"
+        links = f"settings and their reasons: [recipe.toml](recipe.toml); all saved policies: {rungs}"
     yield (
         f"Stable-Baselines3's SAC, seed {info['seed']}: {info['steps']:,} environment steps, "
-        f"{sac['gradient_steps']:g} gradient steps for each, {info['hours']:.1f} hours on one core "
+        f"{sac['gradient_steps']:g} gradient steps per environment step, {info['hours']:.1f} hours on one core "
         f"({where['processor']}). Command: `{info['command']}`; {links}."
     )
-    yield from (
-        "",
-        "Policies kept, by measured return of the sampling policy; `--level FRACTION` takes the nearest:",
-        "",
+    yield ""
+    yield (
+        "Policies of the ladder, with the measured return of the stochastic policy. `--level FRACTION` selects the "
+        "nearest one:"
     )
+    yield ""
     yield from markdown(
         ["step", "mean return", "95% interval", "fraction of expert", "level"],
         [
@@ -190,7 +204,7 @@ def _text(recipe: Recipe, ladder: Ladder, facts: Mapping[str, Any], made: Mappin
     )
     yield from ("", "## Content", "")
     others = ", ".join(f"{name} {version}" for name, version in made.items() if name != "mujoco")
-    yield f"SHA-256 over the arrays in episode order, for {others} and each MuJoCo version:"
+    yield f"SHA-256 over the arrays in episode order, with {others} and each MuJoCo version:"
     yield ""
     rows = [
         [level, version, f"`{content}`"]
@@ -198,7 +212,7 @@ def _text(recipe: Recipe, ladder: Ladder, facts: Mapping[str, Any], made: Mappin
         for version, content in v["content_sha256"].items()
     ]
     yield from markdown(["level", "mujoco", "content"], rows)
-    yield from ("", "`offbench collect` says whether what it recorded is the same.")
+    yield from ("", "`offbench collect` prints whether the dataset that it recorded has the same content.")
 
 
 def _cells(level: str, values: Mapping[str, Any]) -> list[str]:
@@ -234,7 +248,7 @@ def _draw(recipe: Recipe, ladder: Ladder, levels: Mapping[str, Summary], path: P
         edges = np.linspace(low, high, BINS + 1)
         for bottom, summary in enumerate(levels.values()):
             counts, _ = np.histogram(summary.returns, edges)
-            # a square root, so that the few odd episodes are seen beside the many usual ones
+            # a square root, so that rare returns stay visible beside the frequent ones
             right.stairs(bottom + 0.85 * np.sqrt(counts / counts.max()), edges, baseline=bottom, fill=True, color=BLUE)
             right.plot([summary.returns.mean()] * 2, [bottom, bottom + 0.85], color=RED, linewidth=1.2)
         right.set_yticks(np.arange(len(levels)) + 0.3, list(levels))

@@ -251,7 +251,7 @@ class _Recording:
         low, high = MEDIUM_LIMITS
         said = f"medium of {self.recipe.name} is at {fraction:.2f} of the expert's return"
         if not low <= fraction <= high and not accept:
-            raise OffbenchError(f"{said}, far from {MEDIUM:.2f}; `offbench collect --accept` records it all the same")
+            raise OffbenchError(f"{said}, far from {MEDIUM:.2f}; `offbench collect --accept` records it anyway")
         remedy = "" if self.recipe.folder else "; a shorter [sac] segment in the recipe keeps more policies"
         print(
             f"offbench: {said}: no policy of the training is at {MEDIUM:.2f} to {MEDIUM_AT_MOST}{remedy}",

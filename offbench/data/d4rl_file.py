@@ -49,14 +49,14 @@ _WIDE = ("observations", "actions", "next_observations")
 
 
 def read_source(path: Path, file: h5py.File) -> Source:
-    """Return an opened file's columns, checked. Raises OffbenchError if it is no D4RL file, or no honest one."""
+    """Return an opened file's columns, checked. Raises OffbenchError if it is not a D4RL file, or damaged."""
     columns = {}
     for name in (*COLUMNS, *OPTIONAL):
         column = _own(path, file, name)
         if column is not None:
             columns[name] = column
         elif name in COLUMNS:
-            raise OffbenchError(f"{path} is no D4RL file: it has no {name}")
+            raise OffbenchError(f"{path} is not a D4RL file: it has no {name}")
     _check(path, columns)
     return Source(path, columns, _about(path, file))
 
@@ -96,7 +96,7 @@ def _check(path: Path, columns: dict[str, h5py.Dataset]) -> None:
 
 
 def _about(path: Path, file: h5py.File) -> dict[str, Any]:
-    """Return the metadata that `offbench export` left in the file, checked; {} in anybody else's."""
+    """Return the metadata that `offbench export` wrote into the file, checked; {} for other files."""
     text = file.attrs.get("offbench")
     if text is None:
         return {}

@@ -18,7 +18,7 @@ from offbench.data import minari_store
 def download(dataset_id: str) -> None:
     """Download a dataset with Minari, and those that it is combined from, unless it is here already.
 
-    Minari's `download_dataset` writes into a hidden folder, and what is complete is then moved to its place.
+    Minari's `download_dataset` writes to a hidden folder, and the complete dataset is then renamed.
 
     Raises:
         OffbenchError: not an id, no such dataset on the server, no connection, or Minari's client is not installed.

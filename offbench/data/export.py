@@ -62,7 +62,7 @@ def export(dataset_id: str, out: str | Path, *, style: str | None = None, drop_t
     """
     style = _style(Path(out), style)
     if drop_timeouts and style == "d4rl":
-        raise OffbenchError("--drop-timeouts goes with --format npz: whoever reads a D4RL file drops them himself")
+        raise OffbenchError("--drop-timeouts goes with --format npz: readers of D4RL files drop them")
     path = output_file(out)
     with disk_errors(str(path)), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         aside = Path(folder) / path.name

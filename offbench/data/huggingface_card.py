@@ -70,8 +70,8 @@ def _text(summary: Summary) -> Iterator[str]:
     told = {name: ours.get(name) for name in ("env", "level", "seed", "recipe_sha256", "content_sha256")}
     told["imported from"] = ours.get("imported", {}).get("file")
     told |= ours.get("versions", {})
-    known = {name.replace("_", " "): fact(value) for name, value in told.items() if value is not None}
-    yield from _table(known) if known else ["Not recorded by offbench."]
+    recorded = {name.replace("_", " "): fact(value) for name, value in told.items() if value is not None}
+    yield from _table(recorded) if recorded else ["Not recorded by offbench."]
 
 
 def _content(summary: Summary) -> dict[str, str]:

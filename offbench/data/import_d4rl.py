@@ -95,7 +95,7 @@ class _Origin:
     """The environment of a file.
 
     Attributes:
-        recorded: the EnvSpec (JSON) of the environment it was recorded in, None if nobody says.
+        recorded: the EnvSpec (JSON) of the environment it was recorded in, None if unknown.
         evaluated: that of the environment to evaluate policies in.
         recipe: whose action bounds hold where the file has none.
     """

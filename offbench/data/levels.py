@@ -44,7 +44,7 @@ def parse_level(text: str) -> tuple[str, tuple[Part, ...]]:
     if fraction is None:
         raise unknown("level", text, LEVELS)
     if not 0 < fraction <= 1:
-        raise OffbenchError(f"a fraction for --level must lie above 0 and at most at 1, not {text}")
+        raise OffbenchError(f"a fraction for --level must be more than 0 and at most 1, not {text}")
     return f"{_percent(fraction)}percent", (Part(str(fraction)),)
 
 

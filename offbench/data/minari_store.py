@@ -33,7 +33,7 @@ with warnings.catch_warnings():
     from minari.dataset.minari_storage import MinariStorage
 
 KEY = "offbench"  # under which all that Minari has no field for is kept in the metadata
-BYTES_PER_EPISODE = 14_000  # what HDF5 needs beside the numbers themselves, measured on short episodes
+BYTES_PER_EPISODE = 14_000  # what HDF5 needs in addition to the numbers, measured on short episodes
 
 
 def root() -> Path:
@@ -264,7 +264,7 @@ def write(
 
     Args:
         path: the folder of a claimed id; what is there is replaced at the last moment.
-        spec: the environment's EnvSpec as JSON, None if nobody knows it (`spaces` are needed then).
+        spec: the environment's EnvSpec as JSON, None if unknown (`spaces` are needed then).
         metadata: Minari's fields; the content hash joins those under the key `offbench`.
         steps: transitions to come, to see beforehand whether the disk has room.
         spaces: of observations and actions, where the environment is not to be asked (it may be no longer there).

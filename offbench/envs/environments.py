@@ -144,7 +144,7 @@ def time_limit(spec: EnvSpec | None) -> int | None:
 
 
 def _warn_endless(name: str, spec: EnvSpec | None) -> None:
-    """Say, once, that an environment has no time limit, before an episode of it can go on for ever."""
+    """Warn once about an environment without a time limit, in which an episode may never end."""
     if time_limit(spec) is None and name not in _endless and multiprocessing.parent_process() is None:
         _endless.add(name)
         print(

@@ -42,7 +42,7 @@ class SACSettings:
     rung_episodes: int = setting(5, "episodes that screen each rung, stochastic and deterministic each", low=2)
 
     def cycle(self) -> tuple[int, int]:
-        """Return (vectorised steps, gradient steps) of one turn of the training loop, both whole numbers."""
+        """Return (vectorized steps, gradient steps) of one turn of the training loop, both whole numbers."""
         ratio = Fraction(self.gradient_steps * self.envs).limit_denominator(64)
         return ratio.denominator, ratio.numerator
 
@@ -97,7 +97,7 @@ def names() -> list[str]:
 
 
 def load_recipe(name: str) -> Recipe:
-    """Return a shipped recipe by name (`hopper`) or anybody's by path (`./my-env.toml`).
+    """Return a shipped recipe by name (`hopper`), or a recipe file by path (`./my-env.toml`).
 
     Raises:
         OffbenchError: no such recipe, not TOML, an unknown key, a wrong type or value.

@@ -93,7 +93,7 @@ def check_code(spec: EnvSpec) -> None:
 def _check_class(entry_point: Any, base: type) -> None:
     names = ENTRY_POINT.fullmatch(str(entry_point))
     if names is None:
-        raise OffbenchError(f"its entry point {str(entry_point)[:LONGEST]!r} is no module:Class")
+        raise OffbenchError(f"its entry point {str(entry_point)[:LONGEST]!r} does not have the form module:Class")
     if not (is_trusting() or _is_allowed(names[1], names[2], base)):
         kind = "environments" if base is gym.Env else "wrappers"
         raise OffbenchError(
@@ -101,7 +101,9 @@ def _check_class(entry_point: Any, base: type) -> None:
         )
     cls = getattr(importlib.import_module(names[1]), names[2], None)
     if not (isinstance(cls, type) and issubclass(cls, base)):
-        raise OffbenchError(f"its entry point {entry_point!r} is no {base.__name__} class, it is not run")
+        raise OffbenchError(
+            f"its entry point {entry_point!r} is not a class derived from {base.__name__}, so it is not run"
+        )
 
 
 def _is_allowed(module: str, name: str, base: type) -> bool:

@@ -124,9 +124,9 @@ def _onnx(policy: Policy, origin: str) -> bytes:
     actions = len(low)
     layers[-1] = (layers[-1][0][:, :actions], layers[-1][1][:actions])  # a Gaussian's other half is its log std
     x = node("Div", node("Sub", "observations", constant(mean)), constant(std))
-    for place, (weight, bias) in enumerate(layers):
+    for index, (weight, bias) in enumerate(layers):
         x = node("Add", node("MatMul", x, constant(weight)), constant(bias))
-        if place < len(layers) - 1:
+        if index < len(layers) - 1:
             x = node({"relu": "Relu", "tanh": "Tanh"}[policy.activation], x)
     if policy.kind != "gaussian":
         x = node("Add", node("Tanh", x), constant(np.float64(1)))

@@ -1,4 +1,4 @@
-"""The report's datasets: what the runs were trained on, and the shipped cards of the same environments beside it."""
+"""The report's datasets: what the runs were trained on, and the shipped cards of the same environments."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ def _sections(
     yield Section("curves", "Learning curves", [figures(pictures["curves"])], words)
     yield Section("finals", "Final scores, seed by seed", [figures(pictures["finals"])])
     if "beside" in by_name:
-        yield Section("beside", "Beside published numbers", [table(by_name["beside"])])
+        yield Section("beside", "Published scores", [table(by_name["beside"])])
     if "similarity" in by_name:
         more = tag("details", tag("summary", "Both readings"), table(by_name["similarity-details"]))
         yield Section("similarity", by_name["similarity"].title, [table(by_name["similarity"]), more])

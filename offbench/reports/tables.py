@@ -213,7 +213,7 @@ def beside_table(results: Results) -> Table | None:
     header = ["level", "environment", "method", "ours", "ours", *[source for source, _ in sources]]
     small = ["", "", "", "own reference", "D4RL's constants", *[protocol for _, protocol in sources]]
     notes = [DIFFERENT_DATA, "Deviations of published numbers are as printed there."]
-    return Table("beside", "Ours beside published numbers", header, rows, notes, 3, small)
+    return Table("beside", "Our scores and published scores", header, rows, notes, 3, small)
 
 
 def iqms(results: Results) -> dict[Method, tuple[Estimate, Scores]]:

@@ -246,7 +246,7 @@ class Rollouts:
 
     def __exit__(self, *_: object) -> None:
         if self._pool:
-            self._closing.value = 1  # a second of episodes that nobody will look at
+            self._closing.value = 1  # saves a second of episodes that are not needed
             self._pool.shutdown(wait=True, cancel_futures=True)
 
     def submit(self, task: Task) -> Future[Any]:
@@ -271,8 +271,8 @@ class Rollouts:
         """Yield episodes 0, 1, 2, ... of the sampling policy without end, in order. Close the iterator when done.
 
         Args:
-            enough: transitions after which nobody will ask for more: near them tasks become small, and none begins
-                that is not likely to be wanted.
+            enough: the number of transitions that the caller needs: near it, tasks become small, and no episode
+                starts that is unlikely to be needed.
         """
         data, ahead = policy.to_bytes(), 1 if not self._pool else 2 * self.workers + 1
         pending: collections.deque[Future[Any]] = collections.deque()

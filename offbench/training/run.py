@@ -48,7 +48,7 @@ Evaluations = Mapping[int, list[tuple[float, int]]]  # {step: [(return, length) 
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
-    """What trained a run from `step` on: what its numbers depend on beside settings and seed.
+    """What trained a run from `step` on: what its numbers depend on in addition to settings and seed.
 
     Attributes:
         device, precision, versions, hardware: as in offbench.common.provenance.made_with.
@@ -194,7 +194,7 @@ class Run:
             if changed := changes(existing.code, config.code):
                 raise OffbenchError(
                     f"{self.folder} was trained by other code of {config.algorithm}: {changed}; "
-                    "give --fresh to train it anew, or another --runs"
+                    "give --fresh to train it again, or another --runs"
                 )
         elif any(self.folder.glob("checkpoint-*.safetensors")):
             raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
@@ -207,7 +207,7 @@ class Run:
             self.claim(config)  # another process was faster
 
     def clear(self) -> None:
-        """Delete what the folder holds, if it holds a run, so that it is trained anew."""
+        """Delete what the folder holds, if it holds a run, so that it is trained again."""
         if self.config_path.exists():
             with self.locked():
                 for path in self.folder.iterdir():

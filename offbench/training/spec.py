@@ -74,7 +74,7 @@ class RunSpec:
 
     @property
     def times(self) -> tuple[int, int, int]:
-        """What runs of one job must share beside their algorithm: steps, eval_every, eval_episodes."""
+        """What runs of one job must share in addition to their algorithm: steps, eval_every, eval_episodes."""
         return self.steps, self.eval_every, self.eval_episodes
 
 

@@ -46,7 +46,7 @@ class Program:
         self._graphs: dict[Hashable, torch.cuda.CUDAGraph] = {}
         self._recordings: dict[Hashable, Recording] = {}
         self._done: dict[Hashable, int] = {}  # updates of each phase
-        self.eager = not algorithm.capture  # whether every update runs as it is
+        self.eager = not algorithm.capture  # whether every update runs without capture
         self._side: Any = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
 
     def load(self, indices: Tensor, noise: Mapping[str, Tensor], first: int) -> None:
@@ -110,7 +110,7 @@ class Program:
         self.eager = True
         self._recordings, self._graphs = {}, {}
         name = type(self.algorithm).__name__
-        print(f"offbench: {name}.update {reason}: every update runs as it is, which is slower", file=sys.stderr)
+        print(f"offbench: {name}.update {reason}: updates run without capture, which is slower", file=sys.stderr)
 
     def _warm_up(self, phase: Hashable, side: Any) -> None:
         """Do one of the first updates of a phase as it is; after a few, capture the phase for those to come."""
@@ -145,7 +145,7 @@ class Program:
         self.position += 1
 
     def logged(self) -> dict[str, list[float]]:
-        """Return each run's mean of everything logged since the last call: the loop's only synchronisation."""
+        """Return each run's mean of everything logged since the last call: the loop's only synchronization."""
         means = {name: (self.sums[name] / count).tolist() for name, count in self.counts.items()}
         for total in self.sums.values():
             total.zero_()

@@ -138,7 +138,7 @@ class Training:
                 spec.run.clear()
         self.jobs = self.pending()
         self.diverged = [
-            f"{spec.folder} has diverged before and is left as it is; delete it to try again"
+            f"{spec.folder} has diverged and is not trained further; delete it to repeat it"
             for job in self._groups
             for spec in job.specs
             if spec.run.diverged

@@ -59,7 +59,7 @@ FAULTS: dict[str, tuple[str, str]] = {
         "the environment terminates where the data say truncated or nothing",
         "mark these ends as terminations",
     ),
-    "steps-after-end": ("steps go on after the environment's end", "cut the episodes there"),
+    "steps-after-end": ("there are steps after the environment ended the episode", "cut the episodes there"),
 }
 
 

@@ -283,7 +283,7 @@ def test_a_bad_grid_is_one_line(fault: str, home: Path, capsys: pytest.CaptureFi
         (["papr"], "did you mean 'paper'"),
         (["./nothing.toml"], "no grid file"),
         (["smoke", "--budget", "9"], "a budget is a time"),
-        (["smoke", "--budget=-9m"], "a budget must be more than nothing"),
+        (["smoke", "--budget=-9m"], "a budget must be positive"),
         (["smoke", "--shard", "3"], "not a share such as 0/4"),
         (["smoke", "--stack", "0"], "whole number from 1"),
     ],
@@ -354,7 +354,7 @@ def test_a_run_that_diverged_before_is_said_and_left_alone(grid: str, home: Path
     said: list[str] = []
     assert benchmark(prepare(grid, workers=1), say=said.append)
     assert (
-        said[-1] == f"{run.folder.relative_to(home)} has diverged before and is left as it is; delete it to try again"
+        said[-1] == f"{run.folder.relative_to(home)} has diverged and is not trained further; delete it to repeat it"
     )
 
 

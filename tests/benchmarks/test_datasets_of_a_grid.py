@@ -119,7 +119,7 @@ def test_a_ladder_that_lacks_a_policy_is_damaged(tiny: tuple[str, str], home: Pa
 
 
 def test_a_card_of_ones_own_looks_where_the_agent_was_trained(tiny: tuple[str, str]) -> None:
-    with pytest.raises(OffbenchError, match="tiny has no ladder to describe, shipped or in behaviour"):
+    with pytest.raises(OffbenchError, match="tiny has no ladder: none is shipped, and there is none in behaviour"):
         card(tiny[0])
     with pytest.raises(OffbenchError, match="tiny-random-v0 is not recorded yet") as refused:
         card(tiny[0], behaviour_dir=tiny[1])

@@ -28,7 +28,7 @@ CASES: dict[str, tuple[str, str]] = {
     "collect hoper": ("unknown environment 'hoper': did you mean 'hopper'?", ""),
     "collect xyzzy": ("unknown environment 'xyzzy': available:", "hopper"),
     "collect hopper --level medum": ("unknown level 'medum': did you mean 'medium'?", ""),
-    "collect hopper --level 1.5": ("a fraction for --level must lie above 0 and at most at 1", "1.5"),
+    "collect hopper --level 1.5": ("a fraction for --level must be more than 0 and at most 1", "1.5"),
     "collect hopper --level nan": ("unknown level 'nan'", ""),
     "collect hopper --steps ten": ("argument --steps: 'ten' is not a whole number from 1", ""),
     "collect hopper --steps 0": ("argument --steps: '0' is not a whole number from 1", ""),

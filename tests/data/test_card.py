@@ -93,7 +93,7 @@ def test_a_card_is_made_from_the_five_levels(home: Path) -> None:
         assert (folder / name).read_text() == (shipped("inverted-pendulum") / name).read_text()
     assert (folder / "card.png").read_bytes().startswith(b"\x89PNG")
     offbench.collect("inverted-pendulum", "random", steps=500, overwrite=True)
-    with pytest.raises(OffbenchError, match="is not the level that is shipped"):
+    with pytest.raises(OffbenchError, match="does not match the card"):
         card("inverted-pendulum")
 
 
@@ -109,15 +109,15 @@ def test_another_content_is_said_with_the_likely_reason(home: Path) -> None:
     assert (
         compare(recipe, "medium", "abe") == "content equal to the dataset card's, bit for bit"
     )  # the earlier MuJoCo's
-    assert "made with the same versions: another processor" in str(compare(recipe, "medium", "abd"))
+    assert "although the versions are the same" in str(compare(recipe, "medium", "abd"))
     (home / "card.json").write_text(json.dumps(known | {"levels": {"medium": {"content_sha256": {"3.4.9": "abe"}}}}))
-    assert "differs from the dataset card's, made with mujoco 3.4.9" in str(compare(recipe, "medium", "abd"))
+    assert "differs from the dataset card's, which was made with mujoco 3.4.9" in str(compare(recipe, "medium", "abd"))
     (home / "card.json").write_text(json.dumps(known | {"versions": {"numpy": "0.1"}}))
-    assert "differs from the dataset card's, made with numpy 0.1" in str(compare(recipe, "medium", "abd"))
+    assert "differs from the dataset card's, which was made with numpy 0.1" in str(compare(recipe, "medium", "abd"))
 
 
 def test_an_environment_without_a_ladder_has_no_card() -> None:
-    with pytest.raises(OffbenchError, match="ant has no ladder to describe, shipped or in behaviour"):
+    with pytest.raises(OffbenchError, match="ant has no ladder: none is shipped, and there is none in behaviour"):
         card("ant")
 
 
@@ -128,4 +128,4 @@ def test_an_environment_of_ones_own_has_a_card_too(tiny: tuple[str, str], home: 
     text = (card(recipe, home / "card", behaviour_dir) / "README.md").read_text()
     levels = read_json(home / "card" / "card.json")["levels"]
     assert f"| medium | {levels['medium']['transitions']:,} |" in text
-    assert f"every rung: `{behaviour_dir}/tiny/seed-0/ladder`." in text
+    assert f"all saved policies: `{behaviour_dir}/tiny/seed-0/ladder`." in text

@@ -157,7 +157,7 @@ def test_a_policy_as_torchscript_acts_the_same(kind: str, medium: str, home: Pat
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 @pytest.mark.parametrize("kind", ["tanh", "squashed_gaussian", "gaussian"])
 def test_every_kind_that_acts_by_itself(kind: str, activation: str, home: Path, rng: np.random.Generator) -> None:
-    """Bounds that are not symmetric, an odd normalisation, both activations."""
+    """Bounds that are not symmetric, an odd normalization, both activations."""
     sizes = [(5, 9), (9, 7), (7, 2 if kind == "tanh" else 4)]
     layers = tuple((rng.normal(size=s).astype(np.float32), rng.normal(size=s[1]).astype(np.float32)) for s in sizes)
     mean, std = rng.normal(size=5).astype(np.float32), rng.uniform(0.1, 3, 5).astype(np.float32)

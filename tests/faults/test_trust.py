@@ -56,10 +56,13 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"kwargs": {"/etc/passwd": 0}}, "/etc/passwd"),
 ]
 NEVER: list[tuple[dict[str, Any], str]] = [  # with --trust neither
-    ({"id": "Foo-v0", "entry_point": "gymnasium.envs.registration:load_env_creator"}, "is no Env class"),
-    ({"id": "Foo-v0", "entry_point": "os:system"}, "is no Env class"),
-    ({"id": "Foo-v0", "entry_point": "own"}, "'own' is no module:Class"),
-    (wrapped("gymnasium.envs.mujoco.hopper_v5:HopperEnv"), "is no Wrapper class"),
+    (
+        {"id": "Foo-v0", "entry_point": "gymnasium.envs.registration:load_env_creator"},
+        "is not a class derived from Env",
+    ),
+    ({"id": "Foo-v0", "entry_point": "os:system"}, "is not a class derived from Env"),
+    ({"id": "Foo-v0", "entry_point": "own"}, "'own' does not have the form module:Class"),
+    (wrapped("gymnasium.envs.mujoco.hopper_v5:HopperEnv"), "is not a class derived from Wrapper"),
 ]
 ALLOWED: list[dict[str, Any]] = [
     {},

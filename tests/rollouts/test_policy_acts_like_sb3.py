@@ -54,7 +54,7 @@ def test_bounds_are_reached_and_kept() -> None:
     np.testing.assert_array_equal(policy.act(np.zeros((1, 1)), None), [[high[0], low[1]]])
 
 
-def test_observations_are_normalised() -> None:
+def test_observations_are_normalized() -> None:
     mean, std = np.array([2.0, -1.0], np.float32), np.array([4.0, 0.5], np.float32)
     weight, bias = np.eye(2, dtype=np.float32), np.zeros(2, np.float32)
     bounds = np.full(2, -1, np.float32), np.full(2, 1, np.float32)
