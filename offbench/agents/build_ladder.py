@@ -77,7 +77,7 @@ class RungEvaluator:
         if not path.exists():
             return
         with damage(str(path), "is damaged", "delete it"):
-            table = read_json(path)
+            table = read_json(path, "delete it")
             if table["made"] == self._made():
                 self._earlier = {name: dict(table[name]) for name in self._earlier}
 
@@ -254,7 +254,7 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
     roles: dict[int, str] = dict.fromkeys(sorted(others | {medium, expert}), "")
     for step, role in ((medium, "medium"), (expert, "expert")):
         roles[step] = f"{roles[step]}+{role}".lstrip("+")
-    trained = read_json(folder.path / "training.json")
+    trained = read_json(folder.path / "training.json", f"delete {folder.path} to train the agent again")
     info = trained | {
         "versions": trained["versions"] | {"offbench": versions()["offbench"]},
         "format": "offbench-ladder-1",

@@ -108,8 +108,9 @@ def read_ladder(folder: Path) -> Ladder | None:
     """Read a ladder's folder, or return None if there is none. Raises OffbenchError if it is damaged."""
     if not (folder / "ladder.json").exists():
         return None
-    info = read_json(folder / "ladder.json")
-    with damage(f"the ladder in {folder}", "is damaged", "delete it and build it again with `offbench behaviour`"):
+    remedy = f"delete {folder} and build it again with `offbench behaviour`"
+    info = read_json(folder / "ladder.json", remedy)
+    with damage(f"the ladder in {folder}", "is damaged", remedy):
         with open(folder / "ladder.csv", newline="", encoding="utf-8", opener=regular) as file:
             rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
         ladder = Ladder(folder, info, rungs)

@@ -34,6 +34,7 @@ READ_REMEDIES: dict[int | None, str] = {  # of errors that say nothing against a
     **dict.fromkeys((errno.EIO, errno.ENXIO, errno.ENODEV, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN), DISK),
     errno.ENOMEM: "close other programs",
 }
+SHIPPED = "reinstall offbench"  # the remedy for damage to a file that comes with offbench
 ORPHANS = 3.0  # seconds to wait for a lock: processes whose parent was killed notice it within one
 
 
@@ -155,12 +156,14 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=1, sort_keys=False, allow_nan=False) + "\n").encode())
 
 
-def read_json(path: Path, remedy: str = "delete it to start over") -> Any:
-    """Read a JSON file. Raises OffbenchError if it is missing or damaged (the `remedy` says what to do then)."""
+def read_json(path: Path, remedy: str = SHIPPED) -> dict[str, Any]:
+    """Read the JSON object in a file. Raises OffbenchError if it is missing or damaged: the `remedy` is for that."""
     try:
         with damage(str(path), "is damaged or not JSON", remedy):
             value = json.loads(read_text(path))
             json.dumps(value, ensure_ascii=False).encode()  # "\\ud800" is JSON, but cannot be printed or written
+            if not isinstance(value, dict):
+                raise ValueError(f"must be a JSON object, not {json.dumps(value)[:40]}")
             return value
     except FileNotFoundError:
         raise OffbenchError(f"no file {path}") from None

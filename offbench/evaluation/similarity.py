@@ -100,7 +100,7 @@ def read_similarity(run: Run) -> Similarity | None:
     if not path.exists():
         return None
     remedy = f"write it again with `offbench evaluate {run.folder} --similarity`"
-    return read_back(Similarity, read_json(path), path, remedy)
+    return read_back(Similarity, read_json(path, remedy), path, remedy)
 
 
 def _file(run: Run) -> Path:

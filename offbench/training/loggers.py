@@ -133,7 +133,7 @@ class WandB:
         self.state = WandBState(project, secrets.token_hex(6))
         if self.path.exists():
             remedy = "delete it to send everything to a new W&B run"
-            earlier = read_back(WandBState, read_json(self.path), self.path, remedy)
+            earlier = read_back(WandBState, read_json(self.path, remedy), self.path, remedy)
             self.state = earlier if earlier.project == project else self.state
         write_json(self.path, asdict(self.state))
         shown = ("algorithm", "variant", "dataset", "dataset_sha256", "seed", "settings", "versions", "command")

@@ -38,6 +38,7 @@ from offbench.training.source_code import changes
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 FORMAT = "offbench-run-1"
+REPEAT = "delete the run to repeat it"
 DIGITS = 8  # of a content hash, where a table must tell two contents of one dataset id apart
 LARGEST = 1e15  # what no step, return or reference reaches: scores and their squares stay finite
 SMALLEST_GAP = 1e-12  # between the references of a score
@@ -160,13 +161,12 @@ class Run:
             raise OffbenchError(
                 f"no run in {self.folder} (no config.json); a run is RUNS/DATASET/ALGORITHM/VARIANT/seed-N"
             )
-        values = read_json(self.config_path)
-        if isinstance(values, dict):
-            later = values.get("sessions")
-            for session in [values, *(later if isinstance(later, list) else [])]:
-                if isinstance(session, dict):  # earlier versions wrote tf32 (true or false) instead of precision
-                    session.setdefault("precision", "tf32" if session.get("tf32") else "float32")
-        return read_back(RunConfig, values, self.config_path, "delete the run to repeat it")
+        values = read_json(self.config_path, REPEAT)
+        later = values.get("sessions")
+        for session in [values, *(later if isinstance(later, list) else [])]:
+            if isinstance(session, dict):  # earlier versions wrote tf32 (true or false) instead of precision
+                session.setdefault("precision", "tf32" if session.get("tf32") else "float32")
+        return read_back(RunConfig, values, self.config_path, REPEAT)
 
     def claim(self, config: RunConfig) -> None:
         """Write config.json, or check that the run in this folder is the same one.
@@ -224,7 +224,7 @@ class Run:
         Args:
             made: device, precision, versions and hardware (offbench.common.provenance.made_with).
         """
-        config, written = self.config(), read_json(self.config_path)
+        config, written = self.config(), read_json(self.config_path, REPEAT)
         changed = dict(written, steps=max(steps, config.steps))
         if dataclasses.replace(config.history[-1], step=step) != (session := Session(step=step, **made)):
             changed["sessions"] = [*written.get("sessions", []), dataclasses.asdict(session)]
@@ -264,7 +264,7 @@ class Run:
         config = self.config() if self.config_path.exists() else None
         last, count = (config.steps, config.eval_episodes) if config else (LARGEST, 0)
         evaluations: dict[int, list[tuple[float, int]]] = {}
-        with damage(str(self.evaluations_path), "is damaged", "delete the run to repeat it"):
+        with damage(str(self.evaluations_path), "is damaged", REPEAT):
             with open(self.evaluations_path, newline="", encoding="utf-8", opener=regular) as file:
                 reader = csv.DictReader(file, strict=True)
                 if tuple(reader.fieldnames or ()) != EVALUATION_COLUMNS:
@@ -307,7 +307,7 @@ class Run:
         if not path.exists():
             return []
         with (
-            damage(str(path), "is damaged", "delete the run to repeat it"),
+            damage(str(path), "is damaged", REPEAT),
             open(path, newline="", encoding="utf-8", opener=regular) as file,
         ):
             return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
@@ -334,7 +334,7 @@ def find_runs(root: Path) -> list[Run]:
 
 def _is_run(path: Path) -> bool:
     try:
-        config = read_json(path)
+        config = read_json(path, REPEAT)
     except OffbenchError:
         return path.parent.name.startswith("seed-")
-    return isinstance(config, dict) and config.get("format") == FORMAT
+    return config.get("format") == FORMAT

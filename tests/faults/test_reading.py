@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import damage
 from offbench.data import minari_store
 from offbench.data.export import export
+from offbench.training.run import Run
 from offbench.verification.verify import verify
 from tests.data.test_transitions import episode, foreign
 
@@ -166,6 +168,26 @@ def test_metadata_that_are_no_json_are_not_to_be_deleted(house: str) -> None:
     for name in ("load", "show", "export"):
         with pytest.raises(DamagedError, match=r"not JSON .*; record or download the dataset again"):
             attempts(house)[name]()
+
+
+@pytest.mark.parametrize("content", ["", "[]", "null", "3"])
+def test_json_that_is_no_object_is_damage_with_a_remedy_that_works(content: str, house: str, home: Path) -> None:
+    small: dict[str, Any] = {"steps": 4, "eval_every": 2, "hidden": (8,), "batch_size": 4}
+    (folder,) = offbench.train("bc", house, **small)
+    (folder / "config.json").write_text(content)
+    for attempt in (Run(folder).config, lambda: offbench.train("bc", house, **small)):
+        with pytest.raises(DamagedError, match=r"config\.json is damaged .*; delete the run to repeat it"):
+            attempt()
+    shutil.rmtree(folder)
+    assert offbench.train("bc", house, **small) == [folder]
+
+
+def test_a_behaviour_folder_with_other_json_is_named(tiny: tuple[str, str], home: Path) -> None:
+    folder = home / "behaviour" / "tiny" / "seed-0"
+    folder.mkdir(parents=True)
+    (folder / "training.json").write_text("[]")
+    with pytest.raises(DamagedError, match=r"training\.json is damaged .*; delete .*seed-0 to train the agent again"):
+        offbench.behaviour(tiny[0], workers=1)
 
 
 def test_an_id_in_the_metadata_that_is_none_stops_no_export(house: str) -> None:
