@@ -31,7 +31,7 @@ from offbench.envs.recipes import load_recipe
 from offbench.evaluation.evaluate import open_policy
 from offbench.evaluation.renderer import NO_RENDERER, drawing_with, working_backend
 from offbench.rollouts.policy import Policy, uniform
-from offbench.rollouts.rollouts import number
+from offbench.rollouts.rollouts import reset, step
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -161,17 +161,17 @@ def _episode(recording: _Recording, seed: int, index: int, most: float) -> Gener
     env, policy = recording.env, recording.policy
     rng = seeds.generator(seed, Purpose.ACTION, *STREAM, index)
     noisy = policy.needs_noise(not recording.sampled)
-    observation, _ = env.reset(seed=seeds.integer(seed, Purpose.RESET, *STREAM, index))
-    step, total, over = 0, 0.0, False
-    yield _frame(env, step, total, recording.size)
+    observation = reset(env, seeds.integer(seed, Purpose.RESET, *STREAM, index))
+    count, total, over = 0, 0.0, False
+    yield _frame(env, count, total, recording.size)
     while not over:
         noise = policy.draw(rng, 1) if noisy else None
-        observation, reward, terminated, truncated, _ = env.step(policy.act(np.asarray(observation)[None], noise)[0])
-        step, total = step + 1, total + number(reward)
-        over = bool(terminated or truncated or step >= most)
-        if over or step % recording.every == 0:
-            yield _frame(env, step, total, recording.size)
-    return step
+        observation, reward, terminated, truncated = step(env, policy.act(observation[None], noise)[0])
+        count, total = count + 1, total + reward
+        over = terminated or truncated or count >= most
+        if over or count % recording.every == 0:
+            yield _frame(env, count, total, recording.size)
+    return count
 
 
 def _frame(env: gym.Env[Any, Any], step: int, total: float, size: int) -> Image:

@@ -118,10 +118,7 @@ class _Lane:
         self.seed = seeds.integer(task.seed, Purpose.RESET, *task.stream, index)
         self.rng = seeds.generator(task.seed, Purpose.ACTION, *task.stream, index)
         self.limit = time_limit(env.spec) or LONGEST
-        try:
-            self.observations = [np.array(env.reset(seed=self.seed)[0])]  # a copy: environments may reuse their array
-        except Exception as error:
-            raise _failed(env, error) from error
+        self.observations = [reset(env, self.seed)]
         self.actions: list[Array] = []
         self.rewards: list[float] = []
         self.noise: Array = np.empty((0, 0))
@@ -135,15 +132,11 @@ class _Lane:
 
     def step(self, action: Array) -> Episode | None:
         """Take one step; return the whole episode if it was the last one."""
-        try:
-            observation, reward, terminated, truncated, _ = self.env.step(action)
-            self.observations.append(np.array(observation))
-            self.actions.append(action)
-            self.rewards.append(number(reward))
-            over = bool(terminated or truncated)
-        except Exception as error:
-            raise _failed(self.env, error) from error
-        if not over:
+        observation, reward, terminated, truncated = step(self.env, action)
+        self.observations.append(observation)
+        self.actions.append(action)
+        self.rewards.append(reward)
+        if not (terminated or truncated):
             if len(self.rewards) > self.limit:
                 raise OffbenchError(
                     f"an episode of {_name(self.env)} has not ended within {self.limit:,} steps; give the environment "
@@ -152,8 +145,29 @@ class _Lane:
             return None
         rewards = np.array(self.rewards)
         # a step that both terminates and runs out of time has terminated: nothing is left to bootstrap from
-        ends = (bool(terminated), bool(truncated and not terminated))
+        ends = (terminated, truncated and not terminated)
         return Episode(self.seed, np.array(self.observations), np.array(self.actions), rewards, *ends)
+
+
+def reset(env: gym.Env[Any, Any], seed: int | None) -> Array:
+    """Return a copy of an episode's first observation. Raises OffbenchError if the environment fails; it is named."""
+    try:
+        return np.array(env.reset(seed=seed)[0])  # a copy: environments may reuse their array
+    except Exception as error:
+        raise _failed(env, error) from error
+
+
+def step(env: gym.Env[Any, Any], action: Array) -> tuple[Array, float, bool, bool]:
+    """Return a copy of the next observation, the reward, whether it terminated and whether it was truncated.
+
+    Raises:
+        OffbenchError: the environment fails; it is named.
+    """
+    try:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        return np.array(observation), number(reward), bool(terminated), bool(truncated)
+    except Exception as error:
+        raise _failed(env, error) from error
 
 
 def number(reward: Any) -> float:

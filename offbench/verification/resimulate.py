@@ -17,7 +17,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.data.minari_reader import Recorded
-from offbench.rollouts.rollouts import kept_envs, number
+from offbench.rollouts.rollouts import kept_envs, reset, step
 
 STEPS = 40  # of an episode that are replayed one by one
 WHOLE, CLOSE, ROUNDED = 1e-9, 1e-6, 1e-4  # tolerances: same physics, other version, observations kept as float32
@@ -56,13 +56,11 @@ def check(spec: str, episode: Recorded, exact: bool, last_unknown: bool) -> Verd
 
 
 def _from_seed(env: gym.Env[Any, Any], e: Recorded, tolerance: float) -> Verdict:
-    first, _ = env.reset(seed=e.seed)
-    observations, rewards, ends = [np.array(first)], [], (False, False)
+    observations, rewards, ends = [reset(env, e.seed)], [], [False, False]
     for action in e.actions:
-        observation, reward, terminated, truncated, _ = env.step(action)
-        observations.append(np.array(observation))
-        rewards.append(number(reward))
-        ends = (bool(terminated), bool(truncated))
+        observation, reward, *ends = step(env, action)
+        observations.append(observation)
+        rewards.append(reward)
         if any(ends):
             break
     steps = len(rewards)
@@ -158,20 +156,17 @@ class _State:
 
     def _works(self, env: gym.Env[Any, Any]) -> bool:
         """Try it: a step from a set state must lead where the same step leads without setting it."""
-        observation: Any
-        reward: Any
-        observation, reward = env.reset(seed=0)[0], 0.0
+        observation, reward = reset(env, 0), 0.0
         rng = np.random.default_rng(0)
         low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
-        before, action = np.array(observation), low
+        before, action = observation, low
         for _ in range(5):
-            before, action = np.array(observation), rng.uniform(low, high).astype(low.dtype)
-            observation, reward, *_ = env.step(action)
-        after = np.array(observation)
+            before, action = observation, rng.uniform(low, high).astype(low.dtype)
+            observation, reward, *_ = step(env, action)
         self.set(before)
-        again, repaid, *_ = env.step(action)
-        self.rewards = abs(number(repaid) - number(reward)) <= WHOLE * (1 + abs(number(reward)))
-        return not _off(np.array(again)[None, : self.size], after[None, : self.size], WHOLE).any()
+        again, repaid, *_ = step(env, action)
+        self.rewards = abs(repaid - reward) <= WHOLE * (1 + abs(reward))
+        return not _off(again[None, : self.size], observation[None, : self.size], WHOLE).any()
 
 
 def _one_step(env: gym.Env[Any, Any], state: _State, e: Recorded, exact: bool, last_unknown: bool) -> Verdict:
@@ -184,13 +179,13 @@ def _one_step(env: gym.Env[Any, Any], state: _State, e: Recorded, exact: bool, l
     steps = np.array([t for t in steps if complete[t] and not (t == last and last_unknown)], int)
     if not len(steps):
         return Verdict(e.index, "none", 0)
-    env.reset(seed=0)
+    reset(env, 0)
     moved, paid, ended = (np.zeros(len(steps), bool) for _ in range(3))
     for i, t in enumerate(steps):
         state.set(seen[t])
-        observation, reward, ended[i], *_ = env.step(e.actions[t])
+        observation, reward, ended[i], _ = step(env, e.actions[t])
         moved[i] = _far(observation, seen[t + 1], state, tolerance)
-        paid[i] = abs(number(reward) - float(e.rewards[t])) > tolerance * (1 + abs(number(reward)))
+        paid[i] = abs(reward - float(e.rewards[t])) > tolerance * (1 + abs(reward))
     allowed = max(1, SHARE * len(steps)) if rounded else 0
     early = ended & (steps != last)
     moved &= ~early  # what follows an end is another episode
@@ -220,7 +215,7 @@ def _why_step(
         off = []
         for t in near:
             state.set(e.observations[t])
-            observation, *_ = env.step(e.actions[t + offset])
+            observation, *_ = step(env, e.actions[t + offset])
             off.append(_far(observation, e.observations[t + 1].astype(np.float64), state, tolerance))
         if near and sum(off) < 0.2 * len(near) < sum(moved):
             return "shifted-observations", words

@@ -15,11 +15,13 @@ from gymnasium.envs.registration import EnvSpec
 
 import offbench
 from offbench.common.errors import OffbenchError
+from offbench.data.minari_reader import Recorded
 from offbench.envs import environments
 from offbench.envs.environments import action_box, believed_env, box, checked_spec, env_spec, make_env
 from offbench.envs.recipes import d4rl_reference
 from offbench.rollouts.policy import uniform
 from offbench.rollouts.rollouts import Rollouts, number
+from offbench.verification.resimulate import check
 
 PENDULUM = (np.full(1, -3, np.float32), np.full(1, 3, np.float32))
 HOPPER = (-20.272305, 3234.3)  # D4RL's infos.py
@@ -191,6 +193,9 @@ def test_an_environment_that_fails_is_named(steps: str, monkeypatch: pytest.Monk
     monkeypatch.setattr(Steps, "fails", True)
     with pytest.raises(OffbenchError, match=r"Steps-v0 failed: KeyError: 'torque'"):
         play(steps)
+    recorded = Recorded(0, 0, np.zeros((2, 3), np.float32), *(np.zeros((1, 1)) for _ in range(4)))
+    with pytest.raises(OffbenchError, match=r"Steps-v0 failed: KeyError: 'torque'"):
+        check(steps, recorded, True, False)
 
 
 def test_an_environment_without_a_time_limit_is_named_and_does_not_run_for_ever(
