@@ -148,6 +148,8 @@ def card_arguments(parser: Parser, _: list[str]) -> None:
             from offbench.data.huggingface_card import huggingface_card
 
             print(f"saved {huggingface_card(about, out)}")
+        elif about in local_datasets():
+            parser.error(f"{about} is a dataset: give --huggingface, or an environment")
         else:
             from offbench.data.card import card
 

@@ -53,7 +53,8 @@ def _fetch(dataset_id: str) -> None:
         raise OffbenchError(f"cannot download {dataset_id}: {error}") from None
     except Exception as error:  # of Minari, its clients and the network
         reason = " ".join(printable(str(error) or type(error).__name__).split())
-        raise OffbenchError(f"cannot download {dataset_id}: {reason}") from error
+        remedy = "check the id (`minari list remote`) and the connection"
+        raise OffbenchError(f"cannot download {dataset_id}: {reason}; {remedy}") from error
 
 
 @contextlib.contextmanager

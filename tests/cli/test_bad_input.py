@@ -149,6 +149,7 @@ CASES: dict[str, tuple[str, str]] = {
     "export MEDIUM --out out.csv": ("cannot write 'out.csv'", ".npz"),
     "export MEDIUM --out out.npz --format d4rl": ("cannot write 'out.npz'", ".hdf5"),
     "export MEDIUM --out out.hdf5 --format npz": ("cannot write 'out.hdf5'", ".npz"),
+    "card MEDIUM": ("is a dataset: give --huggingface", ""),
     "export-policy policy.safetensors --out policy.txt": ("cannot write 'policy.txt'", ".pt or FILE.onnx"),
     "report --out report.html": ("a report is a folder", "--out report"),
     "show mujoco/hopper/medium-v0": ("no local dataset", "`minari download mujoco/hopper/medium-v0`"),
