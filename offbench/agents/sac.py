@@ -51,7 +51,7 @@ from offbench.common.seeds import Purpose
 from offbench.envs.environments import make_env
 from offbench.envs.recipes import Recipe, SACSettings
 from offbench.rollouts.policy import Policy
-from offbench.rollouts.rollouts import MEASURES, Rollouts, summary
+from offbench.rollouts.rollouts import MEASURES, Named, Rollouts, summary
 
 SCREENED = ("step", "hours", *(f"{how}_{m}" for how in ("stochastic", "deterministic") for m in MEASURES), "episodes")
 POLICIES = 100  # of a segment at most, its rung included,
@@ -174,7 +174,7 @@ def _make_sac(recipe: Recipe, spec: str, buffer_size: int) -> SAC:
         # float32 halves the replay buffer; the medium-replay level keeps exactly what SAC saw
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # Gymnasium's remark on the bounds' precision
-            return gym.wrappers.DtypeObservation(make_env(spec), np.float32)
+            return gym.wrappers.DtypeObservation(Named(make_env(spec)), np.float32)
 
     model = SAC(
         "MlpPolicy",

@@ -143,16 +143,17 @@ class _Lane:
                     "a time limit (max_episode_steps)"
                 )
             return None
-        rewards = np.array(self.rewards)
+        observations, rewards = np.array(self.observations), np.array(self.rewards)
+        _check_finite(self.env, observations, rewards)
         # a step that both terminates and runs out of time has terminated: nothing is left to bootstrap from
         ends = (terminated, truncated and not terminated)
-        return Episode(self.seed, np.array(self.observations), np.array(self.actions), rewards, *ends)
+        return Episode(self.seed, observations, np.array(self.actions), rewards, *ends)
 
 
 def reset(env: gym.Env[Any, Any], seed: int | None) -> Array:
     """Return a copy of an episode's first observation. Raises OffbenchError if the environment fails; it is named."""
     try:
-        return np.array(env.reset(seed=seed)[0])  # a copy: environments may reuse their array
+        return _observation(env, env.reset(seed=seed)[0])
     except Exception as error:
         raise _failed(env, error) from error
 
@@ -165,9 +166,36 @@ def step(env: gym.Env[Any, Any], action: Array) -> tuple[Array, float, bool, boo
     """
     try:
         observation, reward, terminated, truncated, _ = env.step(action)
-        return np.array(observation), number(reward), bool(terminated), bool(truncated)
+        return _observation(env, observation), number(reward), bool(terminated), bool(truncated)
     except Exception as error:
         raise _failed(env, error) from error
+
+
+def _observation(env: gym.Env[Any, Any], observation: Any) -> Array:
+    copy = np.array(observation)  # environments may reuse their array
+    if copy.shape != env.observation_space.shape:
+        raise ValueError(f"an observation has shape {copy.shape}, its space {env.observation_space.shape}")
+    return copy
+
+
+def _check_finite(env: gym.Env[Any, Any], observations: Array, rewards: Array | float) -> None:
+    for name, values in (("observation", observations), ("reward", rewards)):
+        if not np.isfinite(values).all():
+            raise _failed(env, ValueError(f"{name} with NaN or infinite numbers"))
+
+
+class Named(gym.Wrapper[Any, Any, Any, Any]):
+    """An environment whose failures, NaN among them, are OffbenchErrors that name it."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """Reset the environment; `options` are not used."""
+        return reset(self.env, seed), {}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Take a step."""
+        observation, reward, *ends = step(self.env, action)
+        _check_finite(self.env, observation, reward)
+        return observation, reward, *ends, {}  # type: ignore[return-value]
 
 
 def number(reward: Any) -> float:

@@ -20,7 +20,7 @@ from offbench.envs import environments
 from offbench.envs.environments import action_box, believed_env, box, checked_spec, env_spec, make_env
 from offbench.envs.recipes import d4rl_reference
 from offbench.rollouts.policy import uniform
-from offbench.rollouts.rollouts import Rollouts, number
+from offbench.rollouts.rollouts import Named, Rollouts, number
 from offbench.verification.resimulate import check
 
 PENDULUM = (np.full(1, -3, np.float32), np.full(1, 3, np.float32))
@@ -32,6 +32,7 @@ class Steps(gym.Env[Any, Any]):
 
     observation_space = gym.spaces.Box(-9, 9, (3,), np.float32)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    observation: Any = np.zeros(3, np.float32)
     reward: Any = 1.0
     ends = True
     fails = False
@@ -42,7 +43,7 @@ class Steps(gym.Env[Any, Any]):
     def step(self, action: Any) -> Any:
         if self.fails:
             raise KeyError("torque")
-        return np.zeros(3, np.float32), self.reward, self.ends, False, {}
+        return self.observation, self.reward, self.ends, False, {}
 
 
 @pytest.fixture
@@ -196,6 +197,29 @@ def test_an_environment_that_fails_is_named(steps: str, monkeypatch: pytest.Monk
     recorded = Recorded(0, 0, np.zeros((2, 3), np.float32), *(np.zeros((1, 1)) for _ in range(4)))
     with pytest.raises(OffbenchError, match=r"Steps-v0 failed: KeyError: 'torque'"):
         check(steps, recorded, True, False)
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"reward": np.nan}, "reward with NaN"),
+        ({"observation": np.full(3, np.inf)}, "observation with NaN or infinite"),
+        ({"observation": np.zeros(4)}, r"shape \(4,\), its space \(3,\)"),
+        ({"observation": "abc"}, r"shape \(\), its space \(3,\)"),
+        ({"fails": True}, "KeyError: 'torque'"),
+    ],
+)
+def test_numbers_that_are_none_are_neither_recorded_nor_learned_from(
+    changes: dict[str, Any], what: str, steps: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in changes.items():
+        monkeypatch.setattr(Steps, name, value)
+    with pytest.raises(OffbenchError, match=f"Steps-v0 failed: .*{what}"):
+        play(steps)
+    env = Named(make_env(steps))  # what SAC learns in
+    env.reset(seed=0)
+    with pytest.raises(OffbenchError, match=f"Steps-v0 failed: .*{what}"):
+        env.step(np.zeros(1, np.float32))
 
 
 def test_an_environment_without_a_time_limit_is_named_and_does_not_run_for_ever(
