@@ -41,8 +41,7 @@ def replay_episodes(folder: TrainingFolder, until: int) -> Iterator[Piece]:
     """Yield the episodes of a training's first `until` steps, segment by segment, stream by stream."""
     segment = folder.recipe.sac.segment
     for start in range(0, until, segment):
-        with np.load(folder.transitions(start + segment), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = folder.read_transitions(start + segment)
         streams = arrays["rewards"].shape[1]
         rows = (until - start) // streams  # all of them, except in the segment that `until` lies in
         arrays = {name: array[:rows] for name, array in arrays.items()}

@@ -18,15 +18,13 @@ import numpy as np
 import torch
 from stable_baselines3 import SAC
 
-from offbench.agents.training_folder import TrainingFolder
+from offbench.agents.training_folder import TRANSITIONS, TrainingFolder
 from offbench.common import checkpoints
 from offbench.common.arrays import Array
 from offbench.common.checkpoints import keep_newest, load_checkpoint, save_checkpoint
-from offbench.common.errors import OffbenchError
 from offbench.common.files import disk_errors
 
 OPTIMIZERS = ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer")
-TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 def transitions_since(model: SAC, step: int) -> dict[str, Array]:
@@ -152,14 +150,7 @@ def _fill_buffer(folder: TrainingFolder, model: SAC, until: int) -> None:
     buffer.reset()
     segment = folder.recipe.sac.segment
     for end in range(segment, until + 1, segment):
-        path = folder.transitions(end)
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                _append(model, {name: arrays[name] for name in TRANSITIONS})
-        except (OSError, ValueError, KeyError) as error:
-            raise OffbenchError(
-                f"{path} is missing or damaged ({error}); delete {folder.path} to train the agent again"
-            ) from None
+        _append(model, folder.read_transitions(end))
 
 
 def _append(model: SAC, arrays: dict[str, Array]) -> None:

@@ -13,8 +13,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from offbench.common.files import damage, read_text
+import numpy as np
+
+from offbench.common.arrays import Array
+from offbench.common.errors import OffbenchError
+from offbench.common.files import damage, read_text, regular
 from offbench.envs.recipes import Recipe
+
+TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,23 @@ class TrainingFolder:
     def transitions(self, step: int) -> Path:
         """The transitions of the segment that ended at `step`."""
         return self.path / "transitions" / f"{step:09d}.npz"
+
+    def read_transitions(self, step: int) -> dict[str, Array]:
+        """Return the transitions of the segment that ended at `step`: {name: [steps, envs, ...]}.
+
+        Raises:
+            OffbenchError: they are missing or damaged.
+        """
+        path, remedy = self.transitions(step), f"delete {self.path} to train the agent again"
+        try:
+            with (
+                damage(str(path), "is damaged", remedy),
+                open(path, "rb", opener=regular) as file,
+                np.load(file, allow_pickle=False) as arrays,
+            ):
+                return {name: arrays[name] for name in TRANSITIONS}
+        except FileNotFoundError:
+            raise OffbenchError(f"{path} is missing; {remedy}") from None
 
 
 def read_rungs(path: Path) -> list[dict[str, float]]:

@@ -190,6 +190,24 @@ def test_a_behaviour_folder_with_other_json_is_named(tiny: tuple[str, str], home
         offbench.behaviour(tiny[0], workers=1)
 
 
+@pytest.mark.parametrize("content", [b"", b"[]", b"PK\x03\x04", None, "a FIFO"])
+def test_a_damaged_segment_of_a_behaviour_agents_training_is_named(
+    content: bytes | str | None, tiny: tuple[str, str], home: Path
+) -> None:
+    folder = shutil.copytree(Path(tiny[1]) / "tiny" / "seed-0", home / "behaviour" / "tiny" / "seed-0")
+    shutil.rmtree(folder / "ladder")
+    path = folder / "transitions" / "000000400.npz"
+    path.unlink()
+    if content == "a FIFO":
+        os.mkfifo(path)
+    elif isinstance(content, bytes):
+        path.write_bytes(content)
+    with pytest.raises(
+        OffbenchError, match=r"000000400\.npz is (damaged|missing).*; delete .*seed-0 to train the agent"
+    ):
+        offbench.behaviour(tiny[0], workers=1)
+
+
 def test_an_id_in_the_metadata_that_is_none_stops_no_export(house: str) -> None:
     path = minari_store.path_of(house) / "data" / "metadata.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"dataset_id": "house"}))
