@@ -67,7 +67,10 @@ class FunctionPolicy:
 
     def source(self) -> bytes:
         """Return the source of the module, for its hash."""
-        path = inspect.getsourcefile(self.function)
+        try:
+            path = inspect.getsourcefile(self.function)
+        except TypeError:  # a function in C has none
+            path = None
         if path is None or not os.path.exists(path):
             return self.name.encode()
         with open(path, "rb") as file:

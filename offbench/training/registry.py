@@ -74,13 +74,13 @@ def failure(error: Exception) -> str:
     The traceback goes to stderr if $OFFBENCH_TRACEBACK is set, or if an installed algorithm has the fault: whoever
     writes one needs it.
     """
-    expected = isinstance(error, OffbenchError | OSError | MemoryError)
+    expected = isinstance(error, OffbenchError | OSError) or _is_out_of_memory(error)
     algorithm = None if expected else _third_party(error.__traceback__)
     if algorithm or os.environ.get("OFFBENCH_TRACEBACK"):
         traceback.print_exception(error)
     if isinstance(error, OffbenchError):
         return str(error)
-    if isinstance(error, MemoryError):
+    if _is_out_of_memory(error):
         return f"not enough memory ({error or 'for this command'}); close other programs, or ask for less"
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
@@ -93,6 +93,11 @@ def failure(error: Exception) -> str:
     if algorithm:
         return f"an error in {algorithm}: {what}; see the traceback above"
     return f"this is a bug in offbench: {what}; please report it; {SHOW_TRACEBACK}"
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    words = ("can't allocate memory", "out of memory")  # PyTorch's, on a CPU and on a GPU
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in words))
 
 
 def _third_party(trace: types.TracebackType | None) -> str | None:

@@ -112,6 +112,7 @@ def test_a_function_of_ones_own(home: Path, tiny: tuple[str, str], monkeypatch: 
         "my_policy_module:wild": "outside the bounds",
         "my_policy_module:none": "has no function 'none'",
         "no_such_module_here:act": "cannot import the policy",
+        "os:getpid": "failed",  # a function in C, without source
     }.items():
         with pytest.raises(OffbenchError, match=message):
             offbench.collect(recipe, policy=name, name="bad", **more)

@@ -236,7 +236,10 @@ def test_odd_terminals_get_what_they_can_show() -> None:
 @pytest.mark.parametrize(
     ("error", "names"),
     [
-        (MemoryError("Unable to allocate 8 EiB"), "8 EiB"),
+        (MemoryError("Unable to allocate 8 EiB"), "not enough memory (Unable to allocate 8 EiB)"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried ..."), "not enough memory (Default"),
+        (RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"), "not enough memory (CUDA"),
+        (RuntimeError("size mismatch"), "bug in offbench"),
         (OSError(24, "Too many open files", "a.csv"), "ulimit -n"),
         (ZeroDivisionError("by zero"), "bug in offbench"),
         (RecursionError("too deep"), "bug in offbench"),
