@@ -85,8 +85,8 @@ def _check_identity(folder: TrainingFolder) -> None:
     if not path.exists():
         write_json(path, identity | {"recipe_sha256": folder.recipe.sha256(), "versions": versions()} | hardware())
         return
-    known = read_json(path, f"delete {folder.path} to train the agent again")
-    started = _flat({key: value for key, value in known.items() if key in identity})
+    recorded = read_json(path, f"delete {folder.path} to train the agent again")
+    started = _flat({key: value for key, value in recorded.items() if key in identity})
     wanted = _flat(json.loads(json.dumps(identity)))
     changed = [key for key in started | wanted if started.get(key) != wanted.get(key)]
     if changed:

@@ -99,11 +99,11 @@ def check_storage(dataset_id: str) -> None:
 def _files(dataset_id: str) -> list[Path]:
     """Return the files of a dataset. Raises DamagedError if one is not a regular file: it could block."""
     paths = sorted((minari_store.path_of(dataset_id) / "data").rglob("*"))
-    found = [path for path in paths if not path.is_dir() or path.suffix == ".hdf5"]
+    files = [path for path in paths if not path.is_dir() or path.suffix == ".hdf5"]
     with reading(dataset_id):
-        for path in found:
+        for path in files:
             os.close(regular(path))
-    return found
+    return files
 
 
 def _elsewhere(file: h5py.File) -> str | None:
