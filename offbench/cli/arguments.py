@@ -161,6 +161,8 @@ def share(text: str) -> tuple[int, int]:
     first, slash, last = text.partition("/")
     if not slash:
         raise argparse.ArgumentTypeError(f"{text!r} is not a share such as 0/4")
+    if natural(first) >= whole(last):
+        raise argparse.ArgumentTypeError(f"a shard is i/n with i from 0 to n - 1, not {text}")
     return natural(first), whole(last)
 
 

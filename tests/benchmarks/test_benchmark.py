@@ -285,6 +285,7 @@ def test_a_bad_grid_is_one_line(fault: str, home: Path, capsys: pytest.CaptureFi
         (["smoke", "--budget", "9"], "a budget is a time"),
         (["smoke", "--budget=-9m"], "a budget must be positive"),
         (["smoke", "--shard", "3"], "not a share such as 0/4"),
+        (["smoke", "--shard", "9/2", "--plan"], "a shard is i/n with i from 0 to n - 1, not 9/2"),
         (["smoke", "--stack", "0"], "whole number from 1"),
     ],
 )
