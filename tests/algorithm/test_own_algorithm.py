@@ -52,7 +52,7 @@ OWN: dict[str, tuple[type, str]] = {
     ),
     "an activation": (
         own(policy=lambda self: PolicyParts("tanh", self.actor.layers(0), activation="gelu")),
-        "AWAC.policy: unknown activation 'gelu'; known: relu, tanh",
+        "AWAC.policy: unknown activation 'gelu'; the activations are relu, tanh",
     ),
     "outputs": (
         own(policy=lambda self: PolicyParts("squashed_gaussian", self.actor.layers(0))),

@@ -114,7 +114,7 @@ def test_another_recipe_than_the_agent_was_trained_by_is_said(
 def test_a_ladder_that_lacks_a_policy_is_damaged(tiny: tuple[str, str], home: Path) -> None:
     shutil.copytree(Path(tiny[1]) / "tiny" / "seed-0" / "ladder", home / "ladder")
     next((home / "ladder" / "policies").iterdir()).unlink()
-    with pytest.raises(OffbenchError, match=r"is damaged .*it lacks policies/.*delete it and build it again"):
+    with pytest.raises(OffbenchError, match=r"is damaged .*it lacks policies/.*delete .*ladder and build it again"):
         read_ladder(home / "ladder")
 
 

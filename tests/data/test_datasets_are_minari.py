@@ -262,6 +262,7 @@ def test_environments_that_reuse_their_array_are_recorded_right() -> None:
     class Reusing(gym.Env[Any, Any]):
         def __init__(self) -> None:
             self.state = np.zeros(1)
+            self.observation_space = gym.spaces.Box(0, 3, (1,), np.float64)
 
         def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
             self.state[:] = 0
