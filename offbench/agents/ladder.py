@@ -23,7 +23,7 @@ from offbench.common.files import damage, read_json, regular
 from offbench.common.scores import normalize
 from offbench.envs.environments import same_environment
 from offbench.envs.recipes import Recipe, load_recipe, names
-from offbench.envs.same_physics import warn_other_physics
+from offbench.envs.version_warning import warn_other_physics
 from offbench.rollouts.policy import Policy, load_policy
 
 BEHAVIOUR = Path("behaviour")  # where trainings live unless the user says otherwise

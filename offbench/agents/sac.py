@@ -44,7 +44,7 @@ from offbench.common.files import (
     write_bytes,
     write_json,
 )
-from offbench.common.processes import stops_noted
+from offbench.common.interrupts import stops_noted
 from offbench.common.progress import Progress, duration
 from offbench.common.provenance import hardware, versions
 from offbench.common.seeds import Purpose

@@ -14,11 +14,12 @@ from offbench.algorithm.interface import Algorithm
 from offbench.algorithm.mlp import products_by
 from offbench.data.transitions import Transitions
 from offbench.envs.environments import make_env
+from offbench.training.captured_update import RECORDED
 from offbench.training.devices import arithmetic
 from offbench.training.grouping import stack_size
 from offbench.training.registry import load_algorithm
 from offbench.training.spec import RunSpec
-from offbench.training.stack import RECORDED, Stack
+from offbench.training.stack import Stack
 
 SECONDS = 0.5  # that a measurement lasts at least
 ROWS = 4096  # random transitions

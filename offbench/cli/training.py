@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
-import dataclasses
-import functools
 import shlex
-from collections.abc import Iterator, Mapping
 from typing import Any
 
+from offbench.cli.algorithm_flags import add_settings, moved_flag, notices
 from offbench.cli.arguments import Parser, auto, completed, local_datasets, recipes, seed_list, share, trust, whole
 from offbench.cli.results import print_scores
 from offbench.common.terminal import hint, note
-
-OPTIMIZATION = ("batch_size", "discount", "tau", "policy_freq", "normalize")  # settings that every method has
 
 SWITCHES = (
     "--tensorboard",
@@ -52,10 +47,10 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         parser.epilog = f"`offbench train ALGO --help` shows an algorithm's own settings.\n\n{parser.epilog}"
         parser.set_defaults(run=lambda **_: parser.error("name the algorithm first: offbench train ALGO --dataset ID"))
         return
-    moved = _moved(algorithm, words)
+    moved = moved_flag(algorithm, words)
     algorithm = "bdb_plus" if moved else algorithm
     parser.asked = f"offbench train {algorithm}"
-    config = _settings(parser, algorithm)
+    config = add_settings(parser, algorithm)
 
     def run(**arguments: Any) -> None:
         from offbench.training.run import Run
@@ -69,7 +64,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         folders = train(**rest, **settings, command=shlex.join(["offbench", "train", *words]))
         for folder in folders:
             print(folder)
-        for text in _notices(config, settings):
+        for text in notices(config, settings):
             note(text)
         if any(Run(folder).evaluations() for folder in folders):
             hint("offbench", "normalize", *([] if rest["runs"] == "runs" else ["--runs", rest["runs"]]))
@@ -78,63 +73,6 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
             hint("offbench", "evaluate", str(folders[0]), "--env", "RECIPE")
 
     parser.set_defaults(run=run)
-
-
-def _moved(algorithm: str, words: list[str]) -> str | None:
-    """Return the first flag that the algorithm had in earlier versions and bdb_plus has now; None if there is none."""
-    from offbench.training.registry import FORMER_SETTINGS
-
-    former = {f"--{name.replace('_', '-')}" for name in FORMER_SETTINGS.get(algorithm, {})}
-    return next((flag for flag in (word.partition("=")[0] for word in words) if flag in former), None)
-
-
-def _settings(parser: Parser, algorithm: str) -> type:
-    """Add an algorithm's own settings, in groups. Returns its Config."""
-    from offbench.common.settings import fields
-    from offbench.training.registry import load_algorithm, use
-
-    config = load_algorithm(use(algorithm)).Config
-    titles = {
-        "method": f"settings of {algorithm}",
-        "optimization": f"optimization of {algorithm}",
-        "ours": "extensions that are not in the paper",
-    }
-    groups: dict[str, Any] = {}
-    members = fields(config)
-    for kind, title in titles.items():
-        for name, field in members.items():
-            if _kind(name, field) != kind:
-                continue
-            if kind not in groups:
-                groups[kind] = parser.add_argument_group(title)
-            action = groups[kind].add_argument(
-                f"--{name.replace('_', '-')}",
-                dest=f"setting_{name}",
-                nargs="+",
-                metavar="N,N" if isinstance(field.default, tuple) else "X",
-                default=argparse.SUPPRESS,
-                help=_help(field).replace("%", "%%"),
-            )
-            completed(action, functools.partial(list, field.metadata.get("choices") or ()))
-    return config
-
-
-def _kind(name: str, field: dataclasses.Field[Any]) -> str:
-    """Return the group of a setting in the help: `method`, `optimization` or `ours`."""
-    if field.metadata.get("help", "").startswith("ours"):
-        return "ours"
-    return "optimization" if name in OPTIMIZATION or name.endswith(("learning_rate", "hidden")) else "method"
-
-
-def _notices(config: type, settings: Mapping[str, Any]) -> Iterator[str]:
-    """Return what a user should know of the values of settings, as the algorithm's fields have it."""
-    from offbench.common.settings import fields
-
-    for name, field in fields(config).items():
-        values = settings.get(name, [field.default])
-        for value, text in field.metadata.get("notes", {}).items():
-            if value in (values if isinstance(values, list) else [values]):
-                yield text
 
 
 def _algorithm(words: list[str]) -> tuple[str | None, dict[str, Any]]:
@@ -221,12 +159,3 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
             note("stopped at the budget; rerun the same command to resume")
 
     parser.set_defaults(run=run)
-
-
-def _help(field: dataclasses.Field[Any]) -> str:
-    """Return a setting's help, with the words that it may be and its default."""
-    words = " | ".join(field.metadata.get("choices") or ())
-    default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else str(field.default)
-    return (
-        f"{field.metadata.get('help', '').removeprefix('ours: ')} ({words}{'; ' if words else ''}default: {default})"
-    )

@@ -15,8 +15,8 @@ from typing import Any
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import OPEN_FILES
+from offbench.common.interrupts import STOPS, stops_delayed
 
-STOPS = {signal.SIGINT, signal.SIGTERM}
 GRACE = 2.0  # seconds that a worker has to end when its pool closes
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -56,7 +56,7 @@ def quiet_start() -> Iterator[None]:
     """
     script = sys.modules["__main__"]
     threads = {name: "1" for name in THREADS if name not in os.environ}
-    with start_errors(), _stops_delayed():
+    with start_errors(), stops_delayed():
         sys.modules["__main__"] = types.ModuleType("__main__")
         os.environ |= threads
         try:
@@ -65,58 +65,6 @@ def quiet_start() -> Iterator[None]:
             sys.modules["__main__"] = script
             for name in threads:
                 del os.environ[name]
-
-
-@contextlib.contextmanager
-def _stops_delayed() -> Iterator[None]:
-    """Delay Ctrl-C and SIGTERM until the end.
-
-    The started process inherits the signal mask. In this process the mask alone is not enough: another thread, such as
-    a library's, may take the signal, and Python's handler still runs in the main thread.
-    """
-    masks = hasattr(signal, "pthread_sigmask")
-    with stops_noted():
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS) if masks else set()
-        try:
-            yield
-        finally:
-            if masks:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextlib.contextmanager
-def stops_noted(second_at_once: bool = False) -> Iterator[list[int]]:
-    """Collect Ctrl-C and SIGTERM in the list that this yields, and raise the first again at the end.
-
-    Args:
-        second_at_once: let a second Ctrl-C raise KeyboardInterrupt without waiting for the end.
-    """
-    received: list[int] = []
-
-    def note(number: int, frame: types.FrameType | None) -> None:
-        received.append(number)
-        if second_at_once and number == signal.SIGINT:
-            if received.count(number) > 1:
-                signal.default_int_handler(number, frame)
-            announce_stop()
-
-    # only the main thread may set handlers; None is a handler that Python cannot restore
-    stops = STOPS if threading.current_thread() is threading.main_thread() else ()
-    handled = [stop for stop in stops if signal.getsignal(stop) not in (None, signal.SIG_IGN)]
-    handlers = {stop: signal.signal(stop, note) for stop in handled}
-    try:
-        yield received
-    finally:
-        for stop, handler in handlers.items():
-            signal.signal(stop, handler)
-        if received:
-            signal.raise_signal(received[0])
-
-
-def announce_stop() -> None:
-    """Tell the user who pressed Ctrl-C on a terminal what the program waits for."""
-    if sys.stderr.isatty():  # not through Python's buffers, which a signal handler must not use
-        os.write(sys.stderr.fileno(), b"\noffbench: saving a checkpoint; press Ctrl-C again to stop at once\n")
 
 
 class _Worker:

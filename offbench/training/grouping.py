@@ -25,13 +25,14 @@ from offbench.data.recorded_env import say_margin
 from offbench.data.transitions import Transitions
 from offbench.envs.environments import checked_spec, same_environment
 from offbench.envs.recipes import d4rl_reference
-from offbench.envs.same_physics import warn_other_physics
+from offbench.envs.version_warning import warn_other_physics
+from offbench.training.captured_update import WARM_UP
 from offbench.training.devices import Machine
 from offbench.training.registry import load_algorithm
 from offbench.training.run import RunConfig
 from offbench.training.source_code import code_of
 from offbench.training.spec import Job, RunSpec, settings_json
-from offbench.training.stack import WARM_UP, Stack
+from offbench.training.stack import Stack
 
 CPU_STACK = 8  # runs of one process: more runs gain nothing there, and each waits for all of them
 MEMORY_SHARE = 0.8  # of a GPU's free memory that a stack may take

@@ -17,7 +17,8 @@ from multiprocessing.connection import Connection, wait
 from types import TracebackType
 
 from offbench.common.errors import OffbenchError
-from offbench.common.processes import announce_stop, quiet_start, start_worker
+from offbench.common.interrupts import announce_stop
+from offbench.common.processes import quiet_start, start_worker
 from offbench.common.progress import Progress
 from offbench.training.devices import arithmetic
 from offbench.training.grouping import load_datasets

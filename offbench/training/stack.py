@@ -1,166 +1,19 @@
-"""A stack: runs that learn as one program.
-
-Program   one update of every run, fed from fixed buffers: it is captured once for each phase and then replayed,
-          on a GPU as a CUDA graph, on a CPU by offbench.algorithm.cpu_capture
-Stack     the learning state of the runs: train, log, policies, what a checkpoint keeps
-"""
+"""A stack: runs that learn as one program. It trains, logs, and holds the policies and what a checkpoint keeps."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from offbench.algorithm.cpu_capture import NotCapturableError, Recording, attributes, changed_attribute, record
-from offbench.algorithm.interface import Algorithm, PolicyParts, check_logs, stack_configs
+from offbench.algorithm.interface import Algorithm, PolicyParts, stack_configs
 from offbench.common.errors import OffbenchError
 from offbench.data.transitions import Transitions
 from offbench.rollouts.policy import Policy, check_networks
 from offbench.training.batches import CHUNK, Store, draw_chunk
+from offbench.training.captured_update import Program
 from offbench.training.spec import RunSpec
-
-Sums = list[tuple[str, float, int]]  # of each logged quantity: its name, its sum, and over how many updates
-RECORDED = 6  # updates of a phase before a replay is trusted on a CPU: all but the first are recorded and compared
-RECORD_EVERY = 1000  # updates of a phase between two later records of it
-WARM_UP = 3  # updates of a phase before it is captured on a GPU: libraries allocate workspaces in the first ones
-
-
-class Program:
-    """One update of every run, over and over.
-
-    A counter on the device picks each update's rows of the chunk, and logs are added up on the device, so nothing
-    waits for the host.
-    """
-
-    def __init__(self, algorithm: Algorithm, store: Store) -> None:
-        self.algorithm, self.store = algorithm, store
-        self.device = store.observations.device
-        self.position = torch.zeros(1, dtype=torch.int64, device=self.device)
-        self.indices, self.noise = torch.empty(0), dict[str, Tensor]()
-        self.sums: dict[str, Tensor] = {}
-        self.counts: dict[str, int] = {}
-        self._names: dict[Hashable, list[str]] = {}  # what each phase logs
-        self._graphs: dict[Hashable, torch.cuda.CUDAGraph] = {}
-        self._recordings: dict[Hashable, Recording] = {}
-        self._done: dict[Hashable, int] = {}  # updates of each phase
-        self.eager = not algorithm.capture  # whether every update runs without capture
-        self._side: Any = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
-
-    def load(self, indices: Tensor, noise: Mapping[str, Tensor], first: int) -> None:
-        """Copy a chunk's indices and noise into the buffers; the next update takes row `first`."""
-        if not len(self.indices):
-            self.indices, self.noise = indices, dict(noise)
-        self.indices.copy_(indices)
-        for name, values in noise.items():
-            self.noise[name].copy_(values)
-        self.position.fill_(first)
-
-    def run(self, phase: Hashable) -> None:
-        """Do the next update."""
-        if self.eager:
-            self._update(phase)
-        elif self._side is None:
-            self._captured(phase)
-        elif phase in self._graphs:
-            self._graphs[phase].replay()
-        else:
-            self._warm_up(phase, self._side)
-        for name in self._names[phase]:
-            self.counts[name] = self.counts.get(name, 0) + 1
-
-    def _captured(self, phase: Hashable) -> None:
-        """Do an update on the CPU: the first of a phase as it is, the next ones recorded, the rest replayed.
-
-        Every RECORD_EVERY-th is recorded again, so that an update that changes later on is noticed.
-        """
-        done = self._done[phase] = self._done.get(phase, 0) + 1
-        if done > RECORDED and done % RECORD_EVERY:
-            with torch.inference_mode():
-                self._recordings[phase].replay()
-            return
-        before, recording = attributes(self.algorithm), None
-        try:
-            if done == 1:
-                self._update(phase)
-            else:
-                recording = record(lambda: self._update(phase))
-        except NotCapturableError as error:
-            self._leave_eager(f"cannot be captured ({error})")
-            return
-        changed = changed_attribute(before, attributes(self.algorithm), first=done == 1)
-        reason = f"changes the attribute {changed}" if changed else ""
-        if recording is not None:
-            if phase in self._recordings and not recording.same_as(self._recordings[phase]):
-                reason = reason or f"is not the same at every update of phase {phase!r}"
-            if done <= RECORDED:  # a later one is only compared: copying it into other buffers would gain nothing
-                self._recordings[phase] = recording
-        if reason and done > RECORDED:
-            name = type(self.algorithm).__name__
-            raise OffbenchError(
-                f"{name}.update {reason} after {done:,} updates; let `phase` tell apart what differs, or set "
-                f"`capture = False` in class {name}"
-            )
-        if reason:
-            self._leave_eager(reason)
-
-    def _leave_eager(self, reason: str) -> None:
-        self.eager = True
-        self._recordings, self._graphs = {}, {}
-        name = type(self.algorithm).__name__
-        print(f"offbench: {name}.update {reason}: updates run without capture, which is slower", file=sys.stderr)
-
-    def _warm_up(self, phase: Hashable, side: Any) -> None:
-        """Do one of the first updates of a phase as it is; after a few, capture the phase for those to come."""
-        done = self._done[phase] = self._done.get(phase, 0) + 1
-        before = attributes(self.algorithm)
-        side.wait_stream(torch.cuda.current_stream(self.device))
-        with torch.cuda.stream(side):
-            self._update(phase)
-        torch.cuda.current_stream(self.device).wait_stream(side)
-        if changed := changed_attribute(before, attributes(self.algorithm), first=done == 1):
-            self._leave_eager(f"changes the attribute {changed}")
-        elif done == WARM_UP:
-            graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph, stream=side):  # recorded, not run
-                self._update(phase)
-            self._graphs[phase] = graph
-
-    def _update(self, phase: Hashable) -> None:
-        batch = self.store.batch(self.indices.index_select(0, self.position)[0])
-        noise = {name: values.index_select(0, self.position)[0] for name, values in self.noise.items()}
-        logs = self.algorithm.update(batch, noise, phase)
-        where = f"{type(self.algorithm).__name__}.update"
-        if phase not in self._names:
-            check_logs(logs, len(self.store.sizes), where)
-            self._names[phase] = list(logs)
-        elif self._names[phase] != list(logs):  # a replay would log those of the first update
-            raise OffbenchError(f"{where} must log the same names at every update of phase {phase!r}")
-        for name, value in logs.items():
-            if name not in self.sums:
-                self.sums[name] = torch.zeros_like(value, requires_grad=False)
-            self.sums[name] += value.detach()
-        self.position += 1
-
-    def logged(self) -> dict[str, list[float]]:
-        """Return each run's mean of everything logged since the last call: the loop's only synchronization."""
-        means = {name: (self.sums[name] / count).tolist() for name, count in self.counts.items()}
-        for total in self.sums.values():
-            total.zero_()
-        self.counts = {}
-        return means
-
-    def unlogged(self, run: int) -> Sums:
-        """Return one run's sum and count of what has been logged since `logged` was called."""
-        return [(name, float(self.sums[name][run]), count) for name, count in self.counts.items()]
-
-    def go_on_logging(self, run: int, sums: Sums) -> None:
-        """Put `unlogged` sums back."""
-        for name, total, count in sums:
-            self.sums.setdefault(name, torch.zeros(len(self.store.sizes), device=self.device))[run] = total
-            self.counts[name] = count
 
 
 class Stack:

@@ -19,7 +19,7 @@ import numpy as np
 
 from offbench.common import checkpoints
 from offbench.common.files import disk_errors
-from offbench.common.processes import stops_noted
+from offbench.common.interrupts import stops_noted
 from offbench.common.provenance import made_with
 from offbench.common.scores import normalize
 from offbench.common.seeds import Purpose

@@ -16,7 +16,7 @@ from offbench.benchmarks.throughput import random_stack
 from offbench.common.errors import OffbenchError
 from offbench.common.settings import build, setting
 from offbench.envs.recipes import load_recipe
-from offbench.training import stack as stack_module
+from offbench.training import captured_update
 from offbench.training.devices import arithmetic
 from offbench.training.registry import load_algorithm
 from offbench.training.stack import Stack
@@ -222,13 +222,13 @@ def test_what_does_the_same_at_every_update_is_replayed(kind: type, capsys: pyte
 
 
 def test_an_update_that_changes_later_on_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stack_module, "RECORD_EVERY", 20)
+    monkeypatch.setattr(captured_update, "RECORD_EVERY", 20)
 
     class Later(Plain):
         def setup(self, c: Config) -> None:
             super().setup(c)
             count = itertools.count()
-            self.early = lambda: next(count) < stack_module.RECORDED
+            self.early = lambda: next(count) < captured_update.RECORDED
 
         def loss(self, error: Tensor) -> Tensor:
             return super().loss(error) * (1.0 if self.early() else 0.5)

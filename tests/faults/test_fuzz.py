@@ -36,7 +36,7 @@ from offbench.data.import_d4rl import import_d4rl
 from offbench.data.show import Summary
 from offbench.data.transitions import Transitions
 from offbench.envs.recipes import load_recipe, read_recipe, shipped
-from offbench.envs.same_physics import warn_other_physics
+from offbench.envs.version_warning import warn_other_physics
 from offbench.rollouts.policy import Policy, load_policy
 from offbench.training.run import Run
 from tests.data.test_import_and_export import d4rl_file

@@ -25,7 +25,7 @@ from offbench.common.tables import markdown
 from offbench.envs.environments import make_env
 from offbench.envs.recipes import load_recipe
 from offbench.rollouts.rollouts import LANES, Episode, Task, play
-from offbench.training.stack import RECORDED
+from offbench.training.captured_update import RECORDED
 from tests.speed.__main__ import DOCS
 from tests.speed.sides import ENV, stack_of
 

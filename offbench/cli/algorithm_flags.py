@@ -1,0 +1,79 @@
+"""The command-line flags of an algorithm, made from its Config."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from offbench.cli.arguments import Parser, completed
+
+OPTIMIZATION = ("batch_size", "discount", "tau", "policy_freq", "normalize")  # settings that every method has
+
+
+def add_settings(parser: Parser, algorithm: str) -> type:
+    """Add an algorithm's own settings, in groups. Returns its Config."""
+    from offbench.common.settings import fields
+    from offbench.training.registry import load_algorithm, use
+
+    config = load_algorithm(use(algorithm)).Config
+    titles = {
+        "method": f"settings of {algorithm}",
+        "optimization": f"optimization of {algorithm}",
+        "ours": "extensions that are not in the paper",
+    }
+    groups: dict[str, Any] = {}
+    members = fields(config)
+    for kind, title in titles.items():
+        for name, field in members.items():
+            if _kind(name, field) != kind:
+                continue
+            if kind not in groups:
+                groups[kind] = parser.add_argument_group(title)
+            action = groups[kind].add_argument(
+                f"--{name.replace('_', '-')}",
+                dest=f"setting_{name}",
+                nargs="+",
+                metavar="N,N" if isinstance(field.default, tuple) else "X",
+                default=argparse.SUPPRESS,
+                help=_help(field).replace("%", "%%"),
+            )
+            completed(action, functools.partial(list, field.metadata.get("choices") or ()))
+    return config
+
+
+def _kind(name: str, field: dataclasses.Field[Any]) -> str:
+    """Return the group of a setting in the help: `method`, `optimization` or `ours`."""
+    if field.metadata.get("help", "").startswith("ours"):
+        return "ours"
+    return "optimization" if name in OPTIMIZATION or name.endswith(("learning_rate", "hidden")) else "method"
+
+
+def _help(field: dataclasses.Field[Any]) -> str:
+    """Return a setting's help, with the words that it may be and its default."""
+    words = " | ".join(field.metadata.get("choices") or ())
+    default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else str(field.default)
+    return (
+        f"{field.metadata.get('help', '').removeprefix('ours: ')} ({words}{'; ' if words else ''}default: {default})"
+    )
+
+
+def notices(config: type, settings: Mapping[str, Any]) -> Iterator[str]:
+    """Return what a user should know of the values of settings, as the algorithm's fields have it."""
+    from offbench.common.settings import fields
+
+    for name, field in fields(config).items():
+        values = settings.get(name, [field.default])
+        for value, text in field.metadata.get("notes", {}).items():
+            if value in (values if isinstance(values, list) else [values]):
+                yield text
+
+
+def moved_flag(algorithm: str, words: list[str]) -> str | None:
+    """Return the first flag that the algorithm had in earlier versions and bdb_plus has now; None if there is none."""
+    from offbench.training.registry import FORMER_SETTINGS
+
+    former = {f"--{name.replace('_', '-')}" for name in FORMER_SETTINGS.get(algorithm, {})}
+    return next((flag for flag in (word.partition("=")[0] for word in words) if flag in former), None)

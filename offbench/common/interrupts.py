@@ -1,0 +1,65 @@
+"""Ctrl-C and SIGTERM: collected while something is finished first, such as a checkpoint, and then raised again."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import types
+from collections.abc import Iterator
+
+STOPS = {signal.SIGINT, signal.SIGTERM}
+
+
+@contextlib.contextmanager
+def stops_delayed() -> Iterator[None]:
+    """Delay Ctrl-C and SIGTERM until the end.
+
+    The started process inherits the signal mask. In this process the mask alone is not enough: another thread, such as
+    a library's, may take the signal, and Python's handler still runs in the main thread.
+    """
+    masks = hasattr(signal, "pthread_sigmask")
+    with stops_noted():
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS) if masks else set()
+        try:
+            yield
+        finally:
+            if masks:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def stops_noted(second_at_once: bool = False) -> Iterator[list[int]]:
+    """Collect Ctrl-C and SIGTERM in the list that this yields, and raise the first again at the end.
+
+    Args:
+        second_at_once: let a second Ctrl-C raise KeyboardInterrupt without waiting for the end.
+    """
+    received: list[int] = []
+
+    def note(number: int, frame: types.FrameType | None) -> None:
+        received.append(number)
+        if second_at_once and number == signal.SIGINT:
+            if received.count(number) > 1:
+                signal.default_int_handler(number, frame)
+            announce_stop()
+
+    # only the main thread may set handlers; None is a handler that Python cannot restore
+    stops = STOPS if threading.current_thread() is threading.main_thread() else ()
+    handled = [stop for stop in stops if signal.getsignal(stop) not in (None, signal.SIG_IGN)]
+    handlers = {stop: signal.signal(stop, note) for stop in handled}
+    try:
+        yield received
+    finally:
+        for stop, handler in handlers.items():
+            signal.signal(stop, handler)
+        if received:
+            signal.raise_signal(received[0])
+
+
+def announce_stop() -> None:
+    """Tell the user who pressed Ctrl-C on a terminal what the program waits for."""
+    if sys.stderr.isatty():  # not through Python's buffers, which a signal handler must not use
+        os.write(sys.stderr.fileno(), b"\noffbench: saving a checkpoint; press Ctrl-C again to stop at once\n")
