@@ -1,13 +1,15 @@
 """Keep the plain files of finished runs: `python -m tests.keep_runs RUNS docs/results/medium/runs --steps 300000`.
 
 They are config.json, evaluations.csv and losses.csv: all that `offbench report --runs` reads. Of a run that was
-trained further than `--steps`, they are cut there: what a run does up to a step does not depend on its length.
+trained further than `--steps`, they are cut there: what a run does up to a step does not depend on its length. Commands
+lose the folders of the machine.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -32,15 +34,23 @@ def keep(runs: Path, target: Path, steps: int | None = None) -> list[Path]:
         copy.folder.mkdir(parents=True, exist_ok=True)
         for name in FILES:
             shutil.copyfile(run.folder / name, copy.folder / name)
+        config = json.loads(copy.config_path.read_text(encoding="utf-8"))
+        config["command"] = without_folders(config["command"])
         if run.config().steps > last:
             copy.write_evaluations({step: e for step, e in run.evaluations().items() if step <= last})
             copy.write_losses([row for row in run.losses() if row["step"] <= last])
-            config = json.loads(copy.config_path.read_text(encoding="utf-8"))
+            config["steps"] = last
             if "sessions" in config:
                 config["sessions"] = [session for session in config["sessions"] if session["step"] < last]
-            write_json(copy.config_path, config | {"steps": last})
+        write_json(copy.config_path, config)
         copies.append(copy.folder)
     return copies
+
+
+def without_folders(command: str) -> str:
+    """Return a command without its --runs, and with the names of files in place of absolute paths."""
+    command = re.sub(r" --runs \S+", "", command)
+    return re.sub(r"/\S*/(\S+)", r"\1", command)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import offbench
-from tests.keep_runs import keep
+from tests.keep_runs import keep, without_folders
 
 
 def test_a_run_cut_at_a_step_has_the_files_of_a_run_that_ended_there(medium: str) -> None:
@@ -18,3 +18,8 @@ def test_a_run_cut_at_a_step_has_the_files_of_a_run_that_ended_there(medium: str
         ours, theirs = (cut / name).read_text(), (whole / name).read_text()
         assert ours.replace("runs='long'", "runs='short'") == theirs, name
     assert keep(Path("short"), Path("none"), steps=400) == []
+
+
+def test_kept_commands_name_no_folder_of_the_machine() -> None:
+    command = "offbench benchmark /home/me/mine.toml --workers 1 --runs /scratch/runs --precision bfloat16"
+    assert without_folders(command) == "offbench benchmark mine.toml --workers 1 --precision bfloat16"
