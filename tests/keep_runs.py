@@ -1,8 +1,8 @@
 """Keep the plain files of finished runs: `python -m tests.keep_runs RUNS docs/results/medium/runs --steps 300000`.
 
 They are config.json, evaluations.csv and losses.csv: all that `offbench report --runs` reads. Of a run that was
-trained further than `--steps`, they are cut there: what a run does up to a step does not depend on its length. Commands
-lose the folders of the machine.
+trained further than `--steps`, they are cut there: what a run does up to a step does not depend on its length.
+Commands lose the folders of the machine.
 """
 
 from __future__ import annotations
