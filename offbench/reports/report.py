@@ -154,7 +154,7 @@ def _lead(results: Results) -> Markup:
         (f"{len(runs)}", plural(len(runs), "run")),
         (f"{len(results.tasks)}", plural(len(results.tasks), "dataset")),
         (f"{len(results.methods)}", plural(len(results.methods), "method")),
-        (each, f"{plural(seeds[-1], 'seed')} a cell"),
+        (each, f"{plural(seeds[-1], 'seed')} per cell"),
         (f"{sum(trained.reached for trained in runs):,}", "updates trained"),
     ]
     tiles = [tag("li", tag("b", value), tag("span", name)) for value, name in counts]

@@ -291,7 +291,7 @@ def test_one_is_singular(home: Path) -> None:
     made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, reached=10_000)
     made_run(home / "runs", "hopper-medium-v0", "cql", "default", 0, 50, reached=0)
     page = Page(offbench.report(home / "runs", home / "out"))
-    assert "1run1dataset1method1seed a cell" in page.text  # the tiles, one after another
+    assert "1run1dataset1method1seed per cell" in page.text  # the tiles, one after another
     assert "1 of 1 runs is unfinished. 1 more has no evaluation yet." in page.text
 
 
