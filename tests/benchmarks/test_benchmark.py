@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-import random
-import shutil
-import signal
 import subprocess
-import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,7 +14,6 @@ import numpy as np
 import pytest
 
 import offbench
-from offbench.analysis.normalize import score_runs
 from offbench.benchmarks.benchmark import LocalExecutor, benchmark, shard_of
 from offbench.benchmarks.grid import load_grid, shipped_grids
 from offbench.benchmarks.plan import Plan, prepare
@@ -315,37 +309,6 @@ def test_an_id_tells_how_it_is_recorded(text: str, env: str, level: str, home: P
     (home / "grid.toml").write_text(f'datasets = ["{text}"]\n[[algorithms]]\nname = "bc"')
     (source,) = load_grid("./grid.toml").datasets
     assert (source.env, source.level) == (env, level)
-
-
-@pytest.mark.slow
-def test_smoke_survives_five_kill_9(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed at random moments, recordings and trainings: the table is an undisturbed one's."""
-
-    def table(place: str) -> list[dict[str, Any]]:
-        monkeypatch.setenv("MINARI_DATASETS_PATH", str(home / place / "minari"))
-        return score_runs(home / place / "runs")
-
-    def command(place: str) -> list[str]:
-        monkeypatch.setenv("MINARI_DATASETS_PATH", str(home / place / "minari"))
-        return [sys.executable, "-m", "offbench", "benchmark", "smoke", "--runs", f"{place}/runs", "--workers", "2"]
-
-    began = time.monotonic()
-    subprocess.run(command("whole"), check=True, capture_output=True)
-    took, rng, kills, undisturbed = time.monotonic() - began, random.Random(0), 0, table("whole")
-    while kills < 5:  # the fifth may come in a second grid
-        shutil.rmtree(home / "killed", ignore_errors=True)
-        done = False
-        while not done:
-            process = subprocess.Popen(command("killed"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            try:
-                done = process.wait(rng.uniform(0.15, 0.7) * took if kills < 5 else None) == 0
-                assert done
-            except subprocess.TimeoutExpired:
-                process.send_signal(signal.SIGKILL)
-                process.wait()
-                kills += 1
-                time.sleep(1.5)  # its workers notice within a second that it is gone
-        assert json.dumps(table("killed")) == json.dumps(undisturbed)
 
 
 def test_a_run_that_diverged_before_is_said_and_left_alone(grid: str, home: Path) -> None:
