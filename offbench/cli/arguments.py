@@ -27,6 +27,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(formatter_class=_Formatter, **kwargs)
+        self._positionals.title = "arguments"
         self.color = False  # Python 3.14 would color the help, too
 
     def error(self, message: str) -> NoReturn:
@@ -55,8 +56,8 @@ class Parser(argparse.ArgumentParser):
         """Print the help, headings and flags in color on a terminal. Without rich: help must come at once."""
         text, stream = self.format_help(), file or sys.stdout
         if is_terminal(stream) and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb":
-            text = re.sub(r"(?m)^(\S[^:\n]*:)", "\033[1;32m\\1\033[0m", text)
-            text = re.sub(r"(?m)^(  +)(-[\w-]+(?:, --[\w-]+)?|[a-z][\w-]+(?=  ))", "\\1\033[1;36m\\2\033[0m", text)
+            text = re.sub(r"(?m)^(usage:|\S[^:\n]*:$)", "\033[1;32m\\1\033[0m", text)
+            text = re.sub(r"(?m)^(  )(-[\w-]+(?:, --[\w-]+)?|[a-z][\w-]+(?=  ))", "\\1\033[1;36m\\2\033[0m", text)
             stream = getattr(stream, "raw_stream", stream)
         stream.write(text)
 
@@ -65,11 +66,26 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str, **kwargs: Any) -> None:
         super().__init__(prog, max_help_position=HELP_COLUMN, **kwargs)
 
+    def add_usage(
+        self, usage: str | None, actions: Iterable[argparse.Action], groups: Any, prefix: str | None = None
+    ) -> None:
+        """Show what a command needs; its options are listed below."""
+        if usage is None:
+            needed = sorted((a for a in actions if not a.option_strings or a.required), key=lambda a: a.option_strings)
+            parts = [" ".join([*a.option_strings, self._format_args(a, a.dest)]) for a in needed]
+            usage = " ".join([self._prog, *parts, "[options]"])
+        super().add_usage(usage, actions, groups, prefix)
+
     def _format_args(self, action: argparse.Action, default_metavar: str) -> str:
         """Return `X ...` for several values, where argparse has `X [X ...]`."""
-        if action.nargs == "+" and action.option_strings:
+        if action.nargs == "+":
             return f"{action.metavar or default_metavar} ..."
         return super()._format_args(action, default_metavar)
+
+    def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
+        if action.type in (whole, natural):
+            return "N"
+        return "X" if action.type is number else super()._get_default_metavar_for_optional(action)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--steps", type=whole, help="transitions (default: the recipe's, 1,000,000)")
     parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--workers", type=whole, help="recording processes (default: one per core)")
-    parser.add_argument("--id", dest="dataset_id", help="the dataset's id (default: <env>-<level>-v0)")
+    parser.add_argument("--id", dest="dataset_id", metavar="ID", help="the dataset's id (default: <env>-<level>-v0)")
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset with the same id")
     parser.add_argument("--retrain", action="store_true", help="use an agent trained here instead of the shipped one")
     parser.add_argument("--accept", action="store_true", help="take the nearest policy, however far from the level")
@@ -99,8 +99,7 @@ def list_arguments(parser: Parser, _: list[str]) -> None:
         for title, header, rows in sections(contents):
             say(title, "bold")
             if header:
-                is_runs = title == "runs"
-                print_table(header, rows, names=2 if is_runs else 1, group=is_runs)
+                print_table(header, rows, names=2 if title in ("environments", "runs") else 1, group=title == "runs")
             else:
                 print("\n".join(f"  {row[0]}" for row in rows))
             print()
@@ -180,7 +179,9 @@ def verify_arguments(parser: Parser, _: list[str]) -> None:
 def import_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `import-d4rl`."""
     parser.add_argument("file", metavar="FILE.hdf5", help="a D4RL file, or a file that `offbench export` wrote")
-    parser.add_argument("--id", dest="dataset_id", required=True, help="the Minari id, e.g. d4rl-hopper-medium-v2")
+    parser.add_argument(
+        "--id", dest="dataset_id", required=True, metavar="ID", help="the Minari id, e.g. d4rl-hopper-medium-v2"
+    )
     env = parser.add_argument(
         "--env", metavar="RECIPE", help="environment of the file, and for evaluation (default: by its name)"
     )
@@ -201,7 +202,13 @@ def export_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `export`."""
     _dataset(parser)
     parser.add_argument("--out", required=True, metavar="FILE", help="the file to write: .hdf5 (D4RL) or .npz")
-    parser.add_argument("--format", choices=("d4rl", "npz"), dest="style", help="default: by the file's ending")
+    parser.add_argument(
+        "--format",
+        choices=("d4rl", "npz"),
+        dest="style",
+        metavar="FORMAT",
+        help="d4rl or npz (default: by the file's ending)",
+    )
     parser.add_argument(
         "--drop-timeouts", action="store_true", help="npz: leave out the steps that D4RL's qlearning_dataset drops"
     )

@@ -83,7 +83,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "report": Command(
             "write all runs as a page with tables and figures",
             results.report_arguments,
-            ["report", "report --datasets 'hopper-*' --methods td3_bc 'bdb (adaptive)' --title Hopper"],
+            ["report", "report --datasets 'hopper-*' --methods td3_bc 'bdb (adaptive)'"],
         ),
         "compare": Command(
             "compare two methods over the datasets and seeds of both",
@@ -104,7 +104,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
             "write a policy for use without offbench",
             results.export_policy_arguments,
             [
-                "export-policy runs/hopper-medium-v0/td3_bc/default/seed-0 --out policy.pt",
+                "export-policy runs/hopper-medium-v0/bc/default/seed-0 --out bc.pt",
                 "export-policy agent.safetensors --out policy.onnx",
             ],
         ),
@@ -235,7 +235,7 @@ def _parser(words: list[str]) -> Parser:
     parser = _MainParser(prog="offbench", description="Record offline-RL datasets and benchmark algorithms on them.")
     version = _version() if any(word.startswith("--v") for word in words) else ""  # it takes a while to read
     parser.add_argument("--version", action="version", version=version)
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
+    commands = parser.add_subparsers(prog="offbench", dest="command", metavar="COMMAND", parser_class=Parser)
     name = _command(words)
     for each, command in BY_NAME.items():
         description = command.help[0].upper() + command.help[1:].removesuffix(", ...") + "."

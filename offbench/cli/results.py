@@ -19,7 +19,14 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("returns", nargs="*", type=number, metavar="RETURN", help="returns to score, with --env")
     completed(parser.add_argument("--env", help="environment of the returns"), recipes)
     parser.add_argument("--runs", default="runs", metavar="DIR", help=RUNS_HELP)
-    parser.add_argument("--format", choices=FORMATS, default="table", dest="style", help="default: table")
+    parser.add_argument(
+        "--format",
+        choices=FORMATS,
+        default="table",
+        dest="style",
+        metavar="FORMAT",
+        help=f"{', '.join(FORMATS)} (default: table)",
+    )
     parser.add_argument("--plot", metavar="PICTURE", help="also draw the learning curves (.png, .svg, .pdf)")
 
     def run(style: str, plot: str | None, **arguments: Any) -> None:
@@ -95,14 +102,14 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `evaluate`."""
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_POLICY", help="run directories or policy files")
     completed(parser.add_argument("--env", help="environment, instead of the policy's own"), recipes)
-    parser.add_argument("--episodes", type=whole, default=10, help="default: 10")
+    parser.add_argument("--episodes", type=whole, default=10, help="number of episodes (default: 10)")
     parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mode")
     parser.add_argument(
-        "--similarity", action="store_true", help="a run's similar score on its dataset instead of episodes"
+        "--similarity", action="store_true", help="compute a run's similar score on its dataset instead"
     )
     parser.add_argument(
-        "--algorithm", metavar="FILE.py:CLASS", help="similar score: the run's, if it is not installed"
+        "--algorithm", metavar="FILE", help="similar score: FILE.py:CLASS of an algorithm that is not installed"
     )
     parser.add_argument("--tolerance", type=number, default=0.05, help="similar score: share of |Q| (default: 0.05)")
     parser.add_argument(
@@ -146,7 +153,7 @@ def video_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run, a policy file, or ENV:LEVEL (hopper:medium)")
     parser.add_argument("--out", default="video.gif", metavar="FILE", help=".gif or .mp4 (default: video.gif)")
     completed(parser.add_argument("--env", help="environment, instead of the policy's own"), recipes)
-    parser.add_argument("--episodes", type=whole, default=1, help="default: 1")
+    parser.add_argument("--episodes", type=whole, default=1, help="number of episodes (default: 1)")
     parser.add_argument("--seconds", type=number, help="longest duration (default: whole episodes)")
     parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--fps", type=whole, default=25, help="frames per second (default: 25)")

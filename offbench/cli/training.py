@@ -22,7 +22,6 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     """Add the arguments of `train`."""
     from offbench.training.registry import algorithm_names
 
-    parser.usage = "offbench train ALGO --dataset ID ... [options]"
     algorithm, named = _algorithm(words)
     names = ", ".join(algorithm_names())
     argument = parser.add_argument("algorithm", metavar="ALGO", help=f"one of {names}, or ./FILE.py:CLASS")
@@ -100,11 +99,14 @@ def _environment(parser: Parser) -> None:
 def _machine(parser: Parser) -> None:
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
     parser.add_argument("--workers", type=whole, help="processes for training and evaluation (default: one per core)")
-    parser.add_argument("--stack", type=auto, default="auto", help="most runs that train as one program: auto or N")
+    parser.add_argument(
+        "--stack", type=auto, default="auto", metavar="N", help="most runs that train as one program: auto or N"
+    )
     parser.add_argument(
         "--precision",
         default="float32",
-        help="of matrix products: float32, tf32 (GPUs), bfloat16 (GPUs, some CPUs) (default: float32)",
+        metavar="TYPE",
+        help="type of matrix products: float32, tf32 (GPUs), bfloat16 (GPUs, some CPUs) (default: float32)",
     )
     parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the runs (default: runs)")
     trust(parser)
@@ -120,7 +122,13 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
     parser.add_argument("--plan", action="store_true", help="print the runs, their cost and disk space, and exit")
     parser.add_argument("--budget", metavar="TIME", help="stop after this time with checkpoints: 90s, 9m or 2h")
     parser.add_argument("--shard", type=share, default=(0, 1), metavar="I/N", help="run share I of N, counted from 0")
-    parser.add_argument("--executor", choices=("local", "ray"), default="local", help="default: local processes")
+    parser.add_argument(
+        "--executor",
+        choices=("local", "ray"),
+        default="local",
+        metavar="NAME",
+        help="where to train: local or ray (default: local)",
+    )
     parser.add_argument(
         "--address", help="address of the Ray cluster, e.g. auto or ray://head:10001 (default: start one here)"
     )

@@ -105,6 +105,26 @@ def test_every_command_has_an_example_that_parses(capsys: pytest.CaptureFixture[
             assert vars(_parser(words).parse_args(words))["command"] == name
 
 
+@pytest.mark.parametrize("name", BY_NAME)
+def test_the_help_of_a_command_fits(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main([name, "--help"])
+    usage, *lines = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(rf"usage: offbench {name} .*\[options\]", usage)
+    assert max(map(len, lines)) <= 80
+
+
+def test_only_headings_and_flags_of_the_help_have_color(screen: Callable[..., str]) -> None:
+    for name in ("collect", "card"):  # a colon in the description, and a flag in the text of another one
+        colored = re.findall(r"\x1b\[1;3[26]m(.+?)\x1b\[0m", screen(80, name, "--help"))
+        assert {"usage:", "arguments:", "options:", "examples:", "-h, --help"} <= set(colored)
+        assert len(colored) == len(set(colored))
+        assert not any(":" in text[:-1] for text in colored)
+
+
 def test_settings_are_grouped(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["train", "bdb_plus", "--help"])
