@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterator
 from types import TracebackType
 from typing import Any
 
@@ -11,6 +12,7 @@ from offbench.common.terminal import console, is_terminal
 
 PLAIN_INTERVAL = 30.0  # seconds between two plain lines without news
 REFRESH_INTERVAL = 0.1  # seconds between two pictures of the bar
+NARROWEST_BAR = 18  # columns of the bar, its percents and the space around them
 
 
 class Progress:
@@ -30,7 +32,7 @@ class Progress:
         self._bar: Any = None
         if is_terminal(sys.stderr):
             self._bar = _bar()
-            self._task = self._bar.add_task(what, total=total, completed=start, details=self._details())
+            self._task = self._bar.add_task(what, total=total, completed=start, details=self._details(), note="")
             self._bar.start()
 
     def __enter__(self) -> Progress:
@@ -71,7 +73,7 @@ class Progress:
 
     def _update(self) -> None:
         self._last = time.monotonic()
-        self._bar.update(self._task, completed=self.done, details=self._details(), refresh=True)
+        self._bar.update(self._task, completed=self.done, details=self._details(), note=self._note, refresh=True)
 
     def _rate(self) -> float:
         return (self.done - self._first) / max(time.monotonic() - self._began, 1e-9)
@@ -82,8 +84,11 @@ class Progress:
         return f"{duration(left)} left"
 
     def _details(self) -> str:
-        parts = [f"{self.done:,}/{self.total:,}", f"{self._rate():,.0f} steps/s", self._left(), self._note]
-        return ", ".join(filter(None, parts))
+        """Return what stands beside the bar. A narrow terminal leaves out the rate."""
+        done, rate, left = f"{self.done:,}/{self.total:,}", f"{self._rate():,.0f} steps/s", self._left()
+        details = f"{done}, {rate}, {left}"
+        room = self._bar.console.width - len(self.what) - NARROWEST_BAR
+        return details if len(details) <= room else f"{done}, {left}"
 
     def _print(self) -> None:
         self._last, self._printed = time.monotonic(), self.done
@@ -92,8 +97,16 @@ class Progress:
 
 
 def _bar() -> Any:
-    """Return rich's bar for one task: title, bar, percent, details that wrap below where the terminal is narrow."""
+    """Return rich's bar for one task: title, bar, percent and details, and the task's note on a line below."""
     from rich import progress
+    from rich.text import Text
+
+    class Bar(progress.Progress):
+        def get_renderables(self) -> Iterator[Any]:
+            yield self.make_tasks_table(self.tasks)
+            for task in self.tasks:
+                if task.fields["note"]:
+                    yield Text(f"  {task.fields['note']}", style="dim", no_wrap=True, overflow="ellipsis")
 
     columns = [
         progress.TextColumn("{task.description}", markup=False),
@@ -101,7 +114,7 @@ def _bar() -> Any:
         progress.TaskProgressColumn(),
         progress.TextColumn("{task.fields[details]}", style="dim", markup=False),
     ]
-    return progress.Progress(*columns, console=console(sys.stderr), auto_refresh=False, expand=True)
+    return Bar(*columns, console=console(sys.stderr), auto_refresh=False, expand=True)
 
 
 def duration(seconds: float) -> str:

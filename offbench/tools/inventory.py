@@ -129,7 +129,7 @@ def sections(contents: Mapping[str, Any]) -> Iterator[Section]:
             for name, env in contents["environments"].items()
         ]
         yield "environments", ["name", "Gymnasium id", "random return", "expert return"], rows
-    for name, more in (("levels", ", or a fraction such as 0.6"), ("algorithms", "")):
+    for name, more in (("levels", ", or a fraction (0.6)"), ("algorithms", "")):
         if name in contents:
             yield name, [], [[", ".join(contents[name]) + more]]
     if "datasets" in contents:

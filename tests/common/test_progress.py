@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import time
 from pathlib import Path
 
@@ -65,8 +66,25 @@ def test_a_terminal_shows_the_same(clock: Clock, monkeypatch: pytest.MonkeyPatch
         bar.say("a line above")
     assert "recording" in screen.getvalue()
     assert "10%" in screen.getvalue()
-    assert "100/1,000, 10 steps/s, 1 min 30 s left, score 3" in screen.getvalue()
+    assert "100/1,000, 10 steps/s, 1 min 30 s left" in screen.getvalue()
+    assert "  score 3" in screen.getvalue()
     assert "a line above\n" in screen.getvalue()
+
+
+def test_a_narrow_terminal_shows_the_bar_and_the_whole_note(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: True)
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setenv("TERM", "dumb")  # no color and no movement: the last picture alone
+    monkeypatch.setenv("COLUMNS", "80")
+    note = "bdb (adaptive) on halfcheetah-medium-v0: score 41.3 at step 995,000"
+    with progress.Progress(3000, "converting inverted-pendulum-medium-v0") as bar:
+        clock.now = 10.0
+        bar.to(1500, note)
+    picture = [line.rstrip() for line in screen.getvalue().splitlines()]
+    assert f"  {note}" in picture
+    (line,) = [line for line in picture if line.startswith("converting inverted-pendulum-medium-v0 ")]
+    assert re.search(r"v0 ━+╸? +50% 1,500/3,000, 10 s left$", line)
 
 
 def test_a_log_has_a_line_for_every_evaluation(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
