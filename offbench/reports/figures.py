@@ -90,7 +90,7 @@ def curve_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
 
 
 def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str) -> Figure:
-    """Draw one task's final scores: a dot a seed, a bar for their mean."""
+    """Draw one task's final scores: a dot per seed, a bar for their mean."""
     task = entries[0].task
 
     def paint(axes: Any) -> None:
@@ -102,7 +102,9 @@ def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
         axes.set(xlabel=_unit(task), title=shortened(task.name, 44))
 
     means = ", ".join(f"{entry.method.label} {np.mean(entry.scores):.1f}" for entry in entries)
-    return _draw(name, "A dot a seed, a bar for the mean.", f"Final scores on {task.name}. Means: {means}.", paint)
+    return _draw(
+        name, "One dot per seed; the bar is their mean.", f"Final scores on {task.name}. Means: {means}.", paint
+    )
 
 
 def iqm_figure(iqms: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[Method, Line]) -> Figure:
@@ -187,7 +189,7 @@ def loss_figure(
         axes.set(xlabel="updates", ylabel=label, title=shortened(task.name, 44))
 
     alt = f"{label} over training on {task.name}. At the end: {', '.join(ends)}."
-    return _draw(name, "Mean over seeds, their range shaded.", alt, paint, shown)
+    return _draw(name, "Mean over seeds, range shaded.", alt, paint, shown)
 
 
 def _column(entry: Entry, column: str) -> tuple[list[int], np.ndarray[Any, Any]] | None:
@@ -218,11 +220,11 @@ def _named_rows(axes: Any, names: Sequence[str]) -> None:
 
 
 def _two_lines(name: str) -> str:
-    """Return a long name on two lines, the first setting on the first."""
+    """Return a long name on two lines, split after the first of its settings or, if it has one, before it."""
     if len(name) <= 24:
         return name
-    head, comma, tail = name.partition(",")
-    return f"{shortened(head + comma, 24)}\n{shortened(tail, 24)}".rstrip()
+    head, comma, tail = name.partition("," if "," in name else " ")
+    return f"{shortened(head + comma.rstrip(), 24)}\n{shortened(tail.lstrip(), 24)}".rstrip()
 
 
 def shortened(text: str, most: int) -> str:

@@ -71,11 +71,13 @@ def table(data: Table, *, caption: bool = False, download: bool = True) -> Marku
             tag("th", tag("button", breakable(text), type="button"), *more, scope="col", class_=_kind(data, i))
         )
     rows = [tag("tr", *[_cell(data, i, cell) for i, cell in enumerate(row)]) for row in data.rows]
-    title = tag("caption", data.title, class_=None if caption else "unseen")
+    heading = [tag("h4", data.title)] if caption else []
+    title = tag("caption", data.title, class_="unseen")
     files = [
         tag("a", ending.upper(), href=f"tables/{data.name}.{ending}", download=True) for ending in ("csv", "md", "tex")
     ]
     return join(
+        *heading,
         tag(
             "div",
             tag("table", title, tag("thead", tag("tr", *head)), tag("tbody", *rows)),

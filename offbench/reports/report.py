@@ -190,9 +190,7 @@ def _sections(
         words = "BDB's weight of the discriminator against cloning: 0 is TD3+BC, 1 the discriminator alone."
         yield Section("beta", "Beta over training", [figures(pictures["beta"])], words)
     if pictures["q"]:
-        words = (
-            "Mean |Q1| on the dataset's own actions. A critic that diverges is seen here before the score shows it."
-        )
+        words = "Mean |Q1| on the dataset's own actions. A diverging critic shows here before it shows in the score."
         yield Section("critic", "Critic over training", [figures(pictures["q"])], words)
     yield Section("datasets", "Datasets", [table(by_name["datasets"]), *_shipped(results)])
     summary = f"Show {counted(len(by_name['seeds'].rows), 'run')}"
@@ -202,9 +200,7 @@ def _sections(
 
 def _shipped(results: Results) -> list[Markup]:
     shown = cards(results)
-    words = (
-        "What the shipped recipes of these environments record, whole; the runs were trained on the datasets above."
-    )
+    words = "The complete datasets of the shipped recipes. The runs were trained on the datasets listed above."
     return [tag("h3", "Shipped cards, for reference"), tag("p", words, class_="note"), *shown] if shown else []
 
 
@@ -212,4 +208,4 @@ def _waiting(results: Results) -> Markup:
     if not results.waiting:
         return join()
     names = [tag("li", relative(results, run)) for run in results.waiting]
-    return join(tag("p", "Begun, not evaluated yet, and so without a score:"), tag("ul", *names))
+    return join(tag("p", "Runs without an evaluation, and so without a score:"), tag("ul", *names))

@@ -34,7 +34,7 @@ def best_table(results: Results) -> Table | None:
     if not rows:
         return None
     notes = [
-        "The variant with the highest mean score. It was chosen by the score that is shown, so this number is "
-        "optimistic, the more so the more variants there are: to report it, train the chosen variant with new seeds."
+        "The variant with the highest mean score. It was selected by the score shown, so this number is "
+        "optimistic, and more so with more variants. To report it, train the selected variant with new seeds."
     ]
     return Table("best", "Best variant of each algorithm", ["level", "environment", *algorithms], rows, notes, heads=2)

@@ -19,7 +19,7 @@ from offbench.training.run import DIGITS, RunConfig
 PAPER = "BDB paper, Table 1"
 PAPER_METHODS = {"td3_bc", "cql", *(f"bdb beta={beta}" for beta in ("0.25", "0.50", "0.75", "adaptive"))}
 NONE = Cell("-")
-FEW_SEEDS = "No interval where a task has a single seed; with few seeds it covers less than 95% (docs/statistics.md)."
+FEW_SEEDS = "A task with a single seed has no interval; with few seeds it covers less than 95% (docs/statistics.md)."
 DIFFERENT_DATA = (
     "The datasets are not the same: the published numbers are of D4RL's v0 and v2 files, recorded in older "
     "environments by other agents and normalized by D4RL's constants; ours are of the datasets named here. Read them "
@@ -132,8 +132,8 @@ def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
     single = " “± ?”: a single seed has no standard deviation." if 1 in seeds else ""
     notes = [
         f"Mean ± standard deviation over {over}.{single} A seed's score is the mean of its last {LAST} evaluations, "
-        f"never its best ({last} of them here). {scale(results)} The best mean of a row is in bold; whether a "
-        "difference is real, `offbench compare` says.",
+        f"never its best ({last} of them here). {scale(results)} The best mean of a row is in bold; "
+        "`offbench compare` tests whether a difference is more than chance.",
     ]
     if not all(results.comparable(task) for task in results.tasks):
         notes.append(
@@ -212,7 +212,7 @@ def beside_table(results: Results) -> Table | None:
         rows.append([*row_name(results, entry.task), Cell(entry.method.label), *cells])
     header = ["level", "environment", "method", "ours", "ours", *[source for source, _ in sources]]
     small = ["", "", "", "own reference", "D4RL's constants", *[protocol for _, protocol in sources]]
-    notes = [DIFFERENT_DATA, "Deviations of published numbers are as printed there."]
+    notes = [DIFFERENT_DATA, "The deviations of published scores are those of their sources."]
     return Table("beside", "Our scores and published scores", header, rows, notes, 3, small)
 
 
@@ -262,9 +262,8 @@ def improvement_table(results: Results, iqms: Mapping[Method, tuple[Estimate, Sc
         "Probability in percent that a run of the row's method scores above one of the column's, averaged over the "
         f"tasks that both have, with its 95% interval by stratified bootstrap. 50 is a draw. {FEW_SEEDS} An interval "
         "above 50 is therefore no evidence by itself. Bold: `offbench compare` finds the row's method better, as the "
-        "interval of the paired difference and the sign-flip test agree. Each pair is tested by itself: of many "
-        "pairs of equal methods a few come out bold by chance. A pair scored over evaluations at different steps is "
-        "not tested.",
+        "interval of the paired difference and the sign-flip test agree. Each pair is tested by itself, so some of "
+        "many equal pairs are bold by chance. A pair with evaluations at different steps is not tested.",
     ]
     title = "Probability of improvement"
     return Table("improvement", title, ["row above column", *[method.label for method in methods]], rows, notes)
