@@ -71,7 +71,9 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
     ) -> None:
         """Show what a command needs; its options are listed below."""
         if usage is None:
-            needed = sorted((a for a in actions if not a.option_strings or a.required), key=lambda a: a.option_strings)
+            needed = sorted(
+                (a for a in actions if not a.option_strings or a.required), key=lambda a: bool(a.option_strings)
+            )
             parts = [" ".join([*a.option_strings, self._format_args(a, a.dest)]) for a in needed]
             usage = " ".join([self._prog, *parts, "[options]"])
         super().add_usage(usage, actions, groups, prefix)
