@@ -83,7 +83,9 @@ def _check_identity(folder: TrainingFolder) -> None:
     identity["sac"] = recipe["sac"] | {"hidden": list(recipe["sac"]["hidden"])}
     path = folder.path / "training.json"
     if not path.exists():
-        write_json(path, identity | {"recipe_sha256": folder.recipe.sha256(), "versions": versions()} | hardware())
+        write_json(
+            path, identity | {"recipe_sha256": folder.recipe.sha256(), "versions": versions(), "hardware": hardware()}
+        )
         return
     recorded = read_json(path, f"delete {folder.path} to train the agent again")
     started = _flat({key: value for key, value in recorded.items() if key in identity})

@@ -15,15 +15,20 @@ import collections
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_map_only
 
-Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+Args: TypeAlias = tuple[Any, ...]
+Kwargs: TypeAlias = dict[str, Any]
+Call = tuple[Callable[..., object], Args, Kwargs]
+Variant = tuple[Callable[..., object], list[str]]  # a function that writes into given outputs, and their names
+Nested = object  # tensors and plain values in tuples, lists and dicts
 _UNREPEATABLE = {
     torch.Tag.nondeterministic_seeded,  # random numbers
     torch.Tag.data_dependent_output,  # .item()
@@ -48,9 +53,9 @@ class Recording:
 
     def __init__(self) -> None:
         self.calls: list[Call] = []
-        self.key: list[Any] = []
+        self.key: list[tuple[object, Nested]] = []
         self.outside: list[Tensor] = []
-        self._kept: list[Any] = []  # no storage of the record is freed and used again
+        self._kept: list[Nested] = []  # no storage of the record is freed and used again
         self._origins: dict[int, tuple[str, int]] = {}  # of a storage's address: the call that made it, or `outside`
         self._constants: dict[int, int] = {}  # of a storage's address: the call that fills it
 
@@ -70,7 +75,7 @@ class Recording:
             )
         )
 
-    def add(self, name: Any, reads: Any, writes: Any, call: Call, *, constant: bool = False) -> None:
+    def add(self, name: object, reads: Nested, writes: Nested, call: Call, *, constant: bool = False) -> None:
         """Add one call; `reads` and `writes` are nested tensors and plain values.
 
         Args:
@@ -86,7 +91,7 @@ class Recording:
         self._kept.append((reads, writes))
         self.calls.append(call)
 
-    def changed(self, tensors: Any) -> None:
+    def changed(self, tensors: Nested) -> None:
         """Note that a call changes tensors in place: they are no constants."""
         for tensor in _tensors(tensors):
             self._constants.pop(_address(tensor), None)
@@ -96,11 +101,11 @@ class Recording:
         left_out = set(self._constants.values())
         self.calls = [call for index, call in enumerate(self.calls) if index not in left_out]
 
-    def keep(self, tensors: Any) -> None:
+    def keep(self, tensors: Nested) -> None:
         """Keep tensors alive as long as this record."""
         self._kept.append(tensors)
 
-    def _describe(self, tensor: Tensor) -> Any:
+    def _describe(self, tensor: Tensor) -> tuple[object, ...]:
         address = _address(tensor)
         if address not in self._origins:
             self._origins[address] = ("outside", len(self.outside))
@@ -114,7 +119,7 @@ class Recording:
         )
 
 
-def record(update: Callable[[], Any]) -> Recording:
+def record(update: Callable[[], object]) -> Recording:
     """Do an update, and return what it did.
 
     Raises:
@@ -152,7 +157,9 @@ class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
         super().__init__()  # type: ignore[no-untyped-call]
         self.recording, self.problem = recording, ""
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, func: OpOverload, types: object, args: Args = (), kwargs: Kwargs | None = None
+    ) -> Nested:
         kwargs = kwargs or {}
         result = func(*args, **kwargs)
         if _UNREPEATABLE & set(func.tags):
@@ -169,7 +176,7 @@ class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
         return result
 
 
-def attributes(thing: Any) -> dict[str, Any]:
+def attributes(thing: object) -> dict[str, object]:
     """Return the attributes of an object, to be compared with a later state by `changed_attribute`.
 
     Numbers, texts and the contents of lists, dicts, sets and plain objects count by value, anything else by identity.
@@ -178,7 +185,7 @@ def attributes(thing: Any) -> dict[str, Any]:
     return {name: _state(value, frozenset()) for name, value in vars(thing).items()}
 
 
-def changed_attribute(before: dict[str, Any], after: dict[str, Any], *, first: bool) -> str | None:
+def changed_attribute(before: dict[str, object], after: dict[str, object], *, first: bool) -> str | None:
     """Return the name of an attribute that has changed, None if none has.
 
     Args:
@@ -191,7 +198,7 @@ def changed_attribute(before: dict[str, Any], after: dict[str, Any], *, first: b
     return next((name for name in before if name not in after), None)
 
 
-def _state(value: Any, above: frozenset[int]) -> Any:
+def _state(value: object, above: frozenset[int]) -> object:
     """Return what of a value can change, as something comparable."""
     if value is None or isinstance(value, bool | int | float | complex | str | bytes):
         return type(value).__name__, repr(value)  # NaN equals itself so
@@ -211,14 +218,14 @@ def _state(value: Any, above: frozenset[int]) -> Any:
     return id(value), repr(value)
 
 
-def _single(func: Any, args: Any, kwargs: Any) -> Call:
+def _single(func: OpOverload, args: Args, kwargs: Kwargs) -> Call:
     """Return the call of an operation in place; that of a list of one tensor (Adam's step count) as the tensor's."""
     if func is torch.ops.aten._foreach_add_.Scalar and len(args[0]) == 1:
         return args[0][0].add_, (args[1],), kwargs
     return func, args, kwargs
 
 
-def _tensors(nested: Any) -> list[Tensor]:
+def _tensors(nested: Nested) -> list[Tensor]:
     tensors: list[Tensor] = []
     tree_map_only(Tensor, tensors.append, nested)
     return tensors
@@ -228,7 +235,7 @@ def _address(tensor: Tensor) -> int:
     return tensor.untyped_storage().data_ptr() or id(tensor.untyped_storage())
 
 
-def _is_view(result: Any, inputs: Any) -> bool:
+def _is_view(result: Nested, inputs: Nested) -> bool:
     """Return whether an operation only returned its inputs' memory."""
     if not isinstance(result, Tensor):
         outputs = _tensors(result)
@@ -237,18 +244,18 @@ def _is_view(result: Any, inputs: Any) -> bool:
     return any(address == _address(tensor) for tensor in _tensors(inputs))
 
 
-_OUT: dict[Any, tuple[Callable[..., Any], list[str]] | None] = {}  # the variant that writes in place, by operation
+_OUT: dict[OpOverload, Variant | None] = {}  # the variant that writes in place, by operation
 
 
-def _in_place(func: Any, args: Any, kwargs: Any, result: Any) -> Call:
+def _in_place(func: OpOverload, args: Args, kwargs: Kwargs, result: Tensor | Sequence[Tensor | None]) -> Call:
     """Return the call that does the same and writes into `result`."""
     outputs = [result] if isinstance(result, Tensor) else list(result)
-    whole = all(isinstance(output, Tensor) for output in outputs)  # a backward pass has None where nobody asks
+    tensors = [
+        output for output in outputs if isinstance(output, Tensor)
+    ]  # a backward pass has None where nobody asks
+    whole = len(tensors) == len(outputs)
     if whole and func not in _OUT:
-        _OUT[func] = next(
-            (one for one in _variants(func, len(outputs)) if _agrees(one, args, kwargs, outputs)),
-            None,
-        )
+        _OUT[func] = next((v for v in _variants(func, len(tensors)) if _agrees(v, args, kwargs, tensors)), None)
     variant = _OUT[func] if whole else None
     if variant is not None:
         function, names = variant
@@ -256,7 +263,7 @@ def _in_place(func: Any, args: Any, kwargs: Any, result: Any) -> Call:
             return function, args, {**kwargs, **dict(zip(names, outputs, strict=True))}
         return function, args, {**kwargs, "out": tuple(outputs)}
 
-    def copy(*arguments: Any, **named: Any) -> None:
+    def copy(*arguments: object, **named: object) -> None:
         again = func(*arguments, **named)
         for output, new in zip(outputs, [again] if isinstance(again, Tensor) else again, strict=True):
             if output is not None:
@@ -265,7 +272,7 @@ def _in_place(func: Any, args: Any, kwargs: Any, result: Any) -> Call:
     return copy, args, kwargs
 
 
-def _variants(func: Any, count: int) -> Iterator[tuple[Callable[..., Any], list[str]]]:
+def _variants(func: OpOverload, count: int) -> Iterator[Variant]:
     """Yield the ways to call an operation with outputs given: PyTorch's own function first, it costs least."""
     native = getattr(torch, func.overloadpacket.__name__, None)
     if native is not None and count == 1:
@@ -278,7 +285,7 @@ def _variants(func: Any, count: int) -> Iterator[tuple[Callable[..., Any], list[
             yield overload, names
 
 
-def _agrees(variant: tuple[Callable[..., Any], list[str]], args: Any, kwargs: Any, outputs: Sequence[Tensor]) -> bool:
+def _agrees(variant: Variant, args: Args, kwargs: Kwargs, outputs: Sequence[Tensor]) -> bool:
     """Return whether a variant writes the same bits as the operation gave."""
     function, names = variant
     trial = [torch.empty_like(output) for output in outputs]

@@ -17,13 +17,13 @@ import dataclasses
 import typing
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from types import SimpleNamespace
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, Protocol, Unpack
 
 import torch
 from torch import Tensor
 from typing_extensions import TypeVar
 
-from offbench.algorithm.networks import Network, Parameters, Schedule
+from offbench.algorithm.networks import Network, NetworkOptions, Parameters, Schedule
 from offbench.common.errors import OffbenchError
 
 C = TypeVar("C", default=Any)
@@ -116,7 +116,7 @@ class Algorithm(Generic[C]):
     capture: ClassVar[bool] = True
     uses_next_actions: ClassVar[bool] = False
 
-    def __init_subclass__(cls, **options: Any) -> None:
+    def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         for base in cls.__dict__.get("__orig_bases__", ()):
             if typing.get_origin(base) is Algorithm and isinstance(typing.get_args(base)[0], type):
@@ -180,34 +180,45 @@ class Algorithm(Generic[C]):
         outputs: int | None,
         learning_rate: float | Schedule,
         *,
-        hidden: Sequence[int] | None = None,
-        **options: Any,
+        ensemble_size: int | None = None,
+        **options: Unpack[NetworkOptions],
     ) -> Network:
         """Return a network for each run.
 
         Args:
             outputs: None for one number, whose axis is left out.
-            hidden: widths of the hidden layers; the setting `hidden` by default.
-            options: ensemble_size, activation, norm, weight_decay, twice_differentiable: see `Network`.
+            ensemble_size: networks for each run; None for one, whose axis is left out.
+            options: see `Network`; `hidden` is the setting of that name by default.
         """
-        config: Any = self.config
-        widths = config.hidden if hidden is None else hidden
         index, self._networks = self._networks, self._networks + 1
-        options = {"learning_rate": learning_rate, "device": self.device} | options
-        return Network(inputs, widths, outputs, self.run_seeds, index, **options)
+        if "hidden" not in options:
+            settings: Any = self.config
+            options["hidden"] = settings.hidden
+        return Network(
+            inputs=inputs,
+            outputs=outputs,
+            run_seeds=self.run_seeds,
+            index=index,
+            learning_rate=learning_rate,
+            ensemble_size=ensemble_size,
+            device=self.device,
+            **options,
+        )
 
-    def actor_network(self, outputs: int, learning_rate: float | Schedule, **options: Any) -> Network:
+    def actor_network(
+        self, outputs: int, learning_rate: float | Schedule, **options: Unpack[NetworkOptions]
+    ) -> Network:
         """Return a network from observations to `outputs`: [runs, batch, outputs]."""
         return self.network(self.observation_dim, outputs, learning_rate, **options)
 
     def critic_network(
-        self, learning_rate: float | Schedule, ensemble_size: int | None = 2, **options: Any
+        self, learning_rate: float | Schedule, ensemble_size: int | None = 2, **options: Unpack[NetworkOptions]
     ) -> Network:
         """Return an ensemble from observations and actions to a number: [ensemble, runs, batch]."""
         inputs = self.observation_dim + self.action_dim
         return self.network(inputs, None, learning_rate, ensemble_size=ensemble_size, **options)
 
-    def value_network(self, learning_rate: float | Schedule, **options: Any) -> Network:
+    def value_network(self, learning_rate: float | Schedule, **options: Unpack[NetworkOptions]) -> Network:
         """Return a network from observations to a number: [runs, batch]."""
         return self.network(self.observation_dim, None, learning_rate, **options)
 
@@ -228,7 +239,7 @@ def _learned(prefix: str, values: Mapping[Any, Any]) -> Iterator[tuple[str, Lear
             yield f"{prefix}{name}", value
 
 
-def check_logs(logs: Any, runs: int, where: str) -> None:
+def check_logs(logs: object, runs: int, where: str) -> None:
     """Raise OffbenchError if an update returned something else than logs, each a tensor [runs]; reads shapes alone."""
     if not isinstance(logs, Mapping):
         raise OffbenchError(f"{where} must return a dict of logs, not a {type(logs).__name__}")

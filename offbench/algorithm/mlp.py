@@ -26,6 +26,7 @@ from contextvars import ContextVar
 from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -33,7 +34,8 @@ from offbench.algorithm.cpu_capture import one_call
 from offbench.algorithm.stacked import layers_of, one_by_one, stacked
 
 _WAY = ContextVar("way", default="numpy")
-Array = np.ndarray[Any, np.dtype[np.float32]]
+Array = npt.NDArray[np.float32]
+Call = tuple[Callable[..., object], tuple[object, ...]]  # a function and its arguments
 Buffer = TypeVar("Buffer", Array, Tensor)
 ALIGNED = 16  # float32 numbers of 64 bytes: rows of buffers begin where a processor's wide registers do
 NARROW = 64  # a product with fewer inputs or outputs gains nothing from bfloat16 on a CPU
@@ -143,7 +145,7 @@ class Pass:
         # what goes into each layer, [batch, in + 1], of each perceptron
         self.into: dict[tuple[int, int], list[Array]] = {}
         self.halves: dict[tuple[int, int, int], _Half] = {}  # the layers in bfloat16, of each perceptron
-        self._steps: list[tuple[Callable[..., Any], tuple[Any, ...], Callable[[], Any] | None]] = []
+        self._steps: list[tuple[*Call, Callable[[], object] | None]] = []
         outputs = _array(self.outputs)
         for member, run in itertools.product(range(ensemble), range(runs)):
             h, self.into[member, run] = x[run], [x[run]]
@@ -192,7 +194,7 @@ class PassBack:
             torch.empty(runs, batch, width) if needed else None
             for width, needed in zip(widths, needs_inputs, strict=True)
         ]
-        self._calls: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
+        self._calls: list[Call] = []
         last = _array(grad)
         if not grad.is_contiguous():
             last = np.empty(grad.shape, np.float32)
@@ -296,7 +298,7 @@ def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
     torch.mul(a, b, out=out)
 
 
-def _through(activation: str, gradient: Array, h: Array) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+def _through(activation: str, gradient: Array, h: Array) -> Call:
     """Return the call that turns the gradient of an activation's output h into that of its input, in place."""
     return (_through_relu if activation == "relu" else _through_tanh), tuple(map(torch.from_numpy, (gradient, h)))
 
@@ -335,7 +337,7 @@ def _shared(use: str, make: Callable[[int, int], Buffer]) -> Callable[[int, int]
     """Return `make` whose arrays all passes of this thread share, for what is used up within one pass."""
 
     def shared(batch: int, width: int) -> Buffer:
-        arrays: dict[Any, Buffer] = _SCRATCH.__dict__.setdefault("arrays", {})
+        arrays: dict[object, Buffer] = _SCRATCH.__dict__.setdefault("arrays", {})
         key = (use, make, batch, width)
         if key not in arrays:
             arrays[key] = make(batch, width)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, TypedDict
 
 import numpy as np
 import torch
@@ -30,6 +30,16 @@ from offbench.common.seeds import Purpose
 ALIGNED = 16
 
 Schedule = Callable[[Tensor], Tensor]  # from the number of earlier steps, a tensor [], to the learning rate
+
+
+class NetworkOptions(TypedDict, total=False):
+    """Arguments of `Network` that have a default in `Algorithm.network`."""
+
+    hidden: Sequence[int]
+    activation: Literal["relu", "tanh"]
+    norm: Literal["none", "before", "after"]
+    twice_differentiable: bool
+    weight_decay: float
 
 
 def cosine_decay(learning_rate: float, steps: int) -> Schedule:

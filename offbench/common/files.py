@@ -14,11 +14,13 @@ import socket
 import stat
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from filelock import FileLock, Timeout
 
 from offbench.common.errors import DamagedError, OffbenchError
+
+JsonObject: TypeAlias = dict[str, Any]  # a JSON object whose values nothing has checked yet
 
 # errno to remedy
 OPEN_FILES: dict[int | None, str] = dict.fromkeys((errno.EMFILE, errno.ENFILE), "raise the limit with `ulimit -n`")
@@ -151,12 +153,12 @@ def output_file(path: str | Path) -> Path:
     return path
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: object) -> None:
     """Write `value` as indented JSON, whole or not at all."""
     write_bytes(path, (json.dumps(value, indent=1, sort_keys=False, allow_nan=False) + "\n").encode())
 
 
-def read_json(path: Path, remedy: str = SHIPPED) -> dict[str, Any]:
+def read_json(path: Path, remedy: str = SHIPPED) -> JsonObject:
     """Read the JSON object in a file. Raises OffbenchError if it is missing or damaged: the `remedy` is for that."""
     try:
         with damage(str(path), "is damaged or not JSON", remedy):
@@ -169,7 +171,7 @@ def read_json(path: Path, remedy: str = SHIPPED) -> dict[str, Any]:
         raise OffbenchError(f"no file {path}") from None
 
 
-def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
+def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
     """Return a CSV file's content; floats keep every digit that matters."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -6,7 +6,6 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 
 class SafeFile:
@@ -25,7 +24,7 @@ class SafeFile:
         if self._error is not None:
             raise self._error
 
-    def write(self, data: Any) -> int:
+    def write(self, data: bytes | memoryview) -> int:
         """Write, or keep the error."""
         view = memoryview(data).cast("B")
         done = 0
@@ -36,7 +35,7 @@ class SafeFile:
                 self._error = error
         return len(view)
 
-    def readinto(self, buffer: Any) -> int:
+    def readinto(self, buffer: bytearray | memoryview) -> int:
         """Read; bytes that a failed write left out are zero."""
         view = memoryview(buffer).cast("B")
         count = self._file.readinto(view) or 0

@@ -6,16 +6,20 @@ import contextlib
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import output_file, write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FORMATS = ("png", "svg", "pdf")
 
 
 @contextlib.contextmanager
-def figure(panels: int = 1) -> Iterator[tuple[Any, list[Any]]]:
+def figure(panels: int = 1) -> Iterator[tuple[Figure, list[Axes]]]:
     """Yield (figure, axes of each panel side by side)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -36,7 +40,7 @@ def picture_file(path: str | Path) -> Path:
     return output_file(path)
 
 
-def save(fig: Any, path: Path) -> Path:
+def save(fig: Figure, path: Path) -> Path:
     """Write a figure in the format of its name's ending."""
     data = io.BytesIO()
     fig.savefig(data, format=path.suffix.lstrip(".").lower(), dpi=150)

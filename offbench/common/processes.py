@@ -11,11 +11,14 @@ import threading
 import time
 import types
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import OPEN_FILES
 from offbench.common.interrupts import STOPS, stops_delayed
+
+if TYPE_CHECKING:
+    from ctypes import c_byte
 
 GRACE = 2.0  # seconds that a worker has to end when its pool closes
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -70,10 +73,10 @@ def quiet_start() -> Iterator[None]:
 class _Worker:
     """The state of this process, if it is a worker."""
 
-    closing: Any = None  # a shared number that the parent sets
+    closing: c_byte | None = None  # a shared number that the parent sets
 
 
-def start_worker(parent: int, closing: Any = None) -> None:
+def start_worker(parent: int, closing: c_byte | None = None) -> None:
     """Leave Ctrl-C to the parent, and end when the parent has ended (even by kill -9).
 
     Args:

@@ -7,9 +7,19 @@ import importlib.metadata
 import os
 import platform
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 PACKAGES = ("offbench", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "minari")
+Hardware = dict[str, str | int | None]
+
+
+class MadeWith(TypedDict):
+    """What a run's numbers depend on in addition to settings and seed: a `Session` of its config.json."""
+
+    device: str
+    precision: str
+    versions: dict[str, str]
+    hardware: Hardware
 
 
 @functools.cache
@@ -24,22 +34,22 @@ def versions() -> dict[str, str]:
     return installed
 
 
-def hardware() -> dict[str, Any]:
+def hardware() -> Hardware:
     """Return processor and cores; `vectors` are the vector instructions of PyTorch, which a run's bits depend on."""
     import torch  # slow to import, and `versions` does without
 
-    processor = {"processor": _processor(), "vectors": torch.backends.cpu.get_cpu_capability()}
-    return {"hardware": processor | {"cores": os.cpu_count(), "machine": platform.machine()}}
+    vectors = torch.backends.cpu.get_cpu_capability()
+    return {"processor": _processor(), "vectors": vectors, "cores": os.cpu_count(), "machine": platform.machine()}
 
 
-def made_with(device: str, precision: str) -> dict[str, Any]:
-    """Return what a run's numbers depend on in addition to settings and seed: a `Session` of its config.json."""
+def made_with(device: str, precision: str) -> MadeWith:
+    """Return what runs are trained with on a device (cpu, cuda or cuda:N)."""
     made = hardware()
     if device != "cpu":
         import torch
 
-        made["hardware"]["gpu"] = torch.cuda.get_device_name(device)
-    return {"device": device, "precision": precision, "versions": versions(), **made}
+        made["gpu"] = torch.cuda.get_device_name(device)
+    return {"device": device, "precision": precision, "versions": versions(), "hardware": made}
 
 
 def has_bfloat16() -> bool:

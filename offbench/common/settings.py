@@ -23,7 +23,7 @@ _type_hints = functools.cache(typing.get_type_hints)  # evaluating them takes mo
 
 
 def setting(
-    default: Any,
+    default: T,
     help: str,
     *,
     low: float | None = None,
@@ -32,7 +32,7 @@ def setting(
     choices: tuple[str, ...] | None = None,
     per_run: bool = False,
     notes: Mapping[str, str] | None = None,
-) -> Any:
+) -> T:
     """Declare a dataclass field: its default, its help and the values it may take.
 
     Args:
@@ -58,7 +58,7 @@ def fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
     return {f.name: f for f in dataclasses.fields(cls) if not f.metadata.get("internal")}
 
 
-def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
+def build(cls: type[T], values: Mapping[str, object], where: str) -> T:
     """Make a settings object from a mapping, e.g. a parsed TOML table.
 
     Args:
@@ -75,7 +75,7 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     return cls(**_checked(cls, values, where, parse=True))
 
 
-def read_back(cls: type[T], values: Any, file: Path | str, remedy: str) -> T:
+def read_back(cls: type[T], values: object, file: Path | str, remedy: str) -> T:
     """Make a metadata object from parsed JSON, as another version of offbench may have written it.
 
     Types are strict (text is no number), and keys that `cls` does not have are ignored. A field may be a dataclass or
@@ -93,13 +93,13 @@ def read_back(cls: type[T], values: Any, file: Path | str, remedy: str) -> T:
         raise DamagedError(f"{file} is damaged ({error}); {remedy}") from None
 
 
-def _from_json(cls: type[T], values: Any) -> T:
+def _from_json(cls: type[T], values: object) -> T:
     if not isinstance(values, dict):
         raise ValueError(f"must be a JSON object, not {_shown(values)}")
     return cls(**_checked(cls, {key: values[key] for key in fields(cls) if key in values}, "", parse=False))
 
 
-def _checked(cls: type, values: Mapping[str, Any], where: str, parse: bool) -> dict[str, Any]:
+def _checked(cls: type, values: Mapping[str, object], where: str, parse: bool) -> dict[str, Any]:
     checked = {key: check(cls, key, value, where, parse=parse) for key, value in values.items()}
     for name, field in fields(cls).items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
@@ -112,7 +112,7 @@ def _error(where: str, text: str) -> OffbenchError:
     return OffbenchError(f"{where}: {text}" if where else text)
 
 
-def check(cls: type, name: str, value: Any, where: str, *, parse: bool = True) -> Any:
+def check(cls: type, name: str, value: object, where: str, *, parse: bool = True) -> Any:
     """Return `value` as the type of the field `name`. Raises OffbenchError, which begins with `where`.
 
     Args:
@@ -130,7 +130,7 @@ def check(cls: type, name: str, value: Any, where: str, *, parse: bool = True) -
     return value
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     """Return any value of a file as short text for an error line."""
     try:
         return f"{value!r:.60}"
@@ -138,7 +138,7 @@ def _shown(value: Any) -> str:
         return "this"
 
 
-def _check_range(name: str, value: Any, metadata: Mapping[str, Any], where: str) -> None:
+def _check_range(name: str, value: object, metadata: Mapping[str, Any], where: str) -> None:
     choices = metadata.get("choices")
     if isinstance(value, str) and choices and value not in choices:
         raise _error(where, f"{name} must be one of {', '.join(choices)}, not {value!r}")
@@ -164,7 +164,7 @@ def _options(hint: Any) -> tuple[Any, ...]:
     return (hint,)
 
 
-def _convert(value: Any, hint: Any, parse: bool) -> Any:
+def _convert(value: object, hint: Any, parse: bool) -> Any:
     """Return `value` as `hint`. Raises TypeError, ValueError, or OffbenchError from a dataclass in it."""
     errors = []
     for option in _options(hint):
@@ -175,7 +175,7 @@ def _convert(value: Any, hint: Any, parse: bool) -> Any:
     raise errors[0]
 
 
-def _convert_one(value: Any, option: Any, parse: bool) -> Any:
+def _convert_one(value: object, option: Any, parse: bool) -> Any:
     if option is Any:
         return value
     if typing.get_origin(option) is tuple:
@@ -221,7 +221,13 @@ def _none(text: str) -> None:
         raise ValueError
 
 
-_FROM_TEXT: dict[Any, Callable[[str], Any]] = {int: _whole, float: float, bool: _truth, str: str, type(None): _none}
+_FROM_TEXT: dict[type, Callable[[str], object]] = {
+    int: _whole,
+    float: float,
+    bool: _truth,
+    str: str,
+    type(None): _none,
+}
 
 
 _TYPE_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "none"}

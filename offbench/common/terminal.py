@@ -11,9 +11,13 @@ import shlex
 import sys
 import textwrap
 from collections.abc import Collection, Sequence
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from offbench.common.text import aligned, printable
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.text import Text
 
 NARROW, NARROWEST = 28, 12  # widths of a column of names
 
@@ -23,7 +27,7 @@ def is_terminal(stream: TextIO | None) -> bool:
     return stream is not None and stream.isatty()
 
 
-def console(stream: TextIO) -> Any:
+def console(stream: TextIO) -> Console:
     """Return rich's console of a stream. Text of files must pass `printable` first: rich writes escape sequences."""
     from rich.console import Console
 
@@ -113,13 +117,13 @@ def print_table(
             screen.print(_indented(line, indent), soft_wrap=True)
 
 
-def _indented(line: Any, by: int) -> Any:
+def _indented(line: Text, by: int) -> Text:
     from rich.text import Text
 
     return Text(" " * by) + line
 
 
-def _lines(row: Sequence[str], layout: Sequence[tuple[int, int, bool]], bold: Collection[int] = ()) -> list[Any]:
+def _lines(row: Sequence[str], layout: Sequence[tuple[int, int, bool]], bold: Collection[int] = ()) -> list[Text]:
     """Return a row as the lines that it takes, its long names wrapped."""
     from rich.text import Text
 

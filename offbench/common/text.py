@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any
 
 
 def plural(number: int, noun: str) -> str:
@@ -46,7 +45,7 @@ def printable(text: str) -> str:
     return _CONTROLS.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
 
 
-def no_formula(cell: Any) -> Any:
+def no_formula(cell: object) -> object:
     """Return a CSV cell that no spreadsheet takes for a formula: such text gets an apostrophe in front."""
     if not (isinstance(cell, str) and cell[1:] and cell[0] in "=+-@\t\r"):
         return cell

@@ -21,8 +21,8 @@ import functools
 import multiprocessing
 import sys
 from collections.abc import Callable
-from typing import Any
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 
@@ -88,7 +88,7 @@ def rotations_changed(model: mujoco.MjModel) -> bool:
     return bool(model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and np.isin(model.jnt_type, turning).any())
 
 
-def model_of(env: Any) -> mujoco.MjModel | None:
+def model_of(env: gym.Env[Array, Array]) -> mujoco.MjModel | None:
     """Return the model of a Gymnasium MuJoCo environment; None for any other environment."""
     model = getattr(env.unwrapped, "model", None)
     return model if isinstance(model, mujoco.MjModel) else None

@@ -15,7 +15,7 @@ import json
 import multiprocessing
 import sys
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium as gym
 import numpy as np
@@ -26,6 +26,8 @@ from offbench.common.errors import OffbenchError, drawing_variable
 from offbench.envs.margin_rule import EARLIER, MARGIN, without_margin
 from offbench.envs.trust import check_code
 
+Env: TypeAlias = gym.Env[Array, Array]
+Space: TypeAlias = gym.Space[Any]
 WHAT_MATTERS = ("id", "kwargs", "max_episode_steps")  # with the contact margins, what makes two specs the same
 LARGEST_BOUND = 1e6  # of actions; what has larger ones, such as float32's largest number, has none
 LONGEST = 20_000  # steps that an episode may take in an environment without a time limit
@@ -79,7 +81,7 @@ def checked_spec(text: str, where: str, observation_dim: int, low: Array, high: 
             f"{where} has observations ({observation_dim},) and actions {low.shape}; the environment {name} has "
             f"{shapes[0]} and {shapes[1]}: {ELSEWHERE}"
         )
-    actions: Any = env.action_space
+    actions = box(env.action_space, f"{where}: actions")
     if not same_bounds(actions, low, high):
         print(
             f"offbench: warning: {where} has actions with bounds {_bounds(low, high)}, the environment {name} takes "
@@ -100,7 +102,7 @@ def _bounds(low: Array, high: Array) -> str:
     return ", ".join(f"[{a:g}, {b:g}]" for a, b in zip(low.flat, high.flat, strict=True))
 
 
-def believed_env(text: str, where: str) -> gym.Env[Any, Any]:
+def believed_env(text: str, where: str) -> Env:
     """Make the environment of an EnvSpec (JSON) that came in a file, if what it names is an environment.
 
     Raises:
@@ -157,14 +159,13 @@ def _warn_endless(name: str, spec: EnvSpec | None) -> None:
 _endless: set[str] = set()  # environments that a warning was printed for
 
 
-def make_env(spec: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
+def make_env(spec: str, render_mode: str | None = None) -> Env:
     """Make the environment of an EnvSpec in JSON, without the step-by-step checker, with the contacts it asks for."""
     plain, rule = without_margin(spec)
     made = EnvSpec.from_json(plain)
     made.disable_env_checker = True
     with _quiet_loading(made.id):
-        options: dict[str, Any] = {"render_mode": render_mode} if render_mode else {}  # else the EnvSpec's own
-        env = gym.make(made, **options)
+        env: Env = gym.make(made, render_mode=render_mode) if render_mode else gym.make(made)  # with the EnvSpec's own
     if hasattr(env.unwrapped, "model"):
         from offbench.envs.contact_margins import model_of, set_contacts  # imports MuJoCo, which is slow to load
 
@@ -199,7 +200,7 @@ def _say_unless_deprecated(warning: str) -> None:
         print(f"offbench: warning: MuJoCo: {warning.strip()}", file=sys.stderr)
 
 
-def _ask_once(env: Any) -> None:
+def _ask_once(env: Env) -> None:
     """Let a task of Gymnasium's own work out once a step whether it is healthy.
 
     Its step asks twice, for the reward and for the end, and each time costs a tenth of the step.
@@ -209,19 +210,19 @@ def _ask_once(env: Any) -> None:
         return
 
     class AskedOnce(kind):  # type: ignore[misc]
-        _healthy: Any = None
+        _healthy: bool | None = None
 
         @property
-        def is_healthy(self) -> Any:
+        def is_healthy(self) -> bool | None:
             if self._healthy is None:
                 self._healthy = super().is_healthy
             return self._healthy
 
-        def do_simulation(self, *arguments: Any) -> None:
+        def do_simulation(self, *arguments: object) -> None:
             super().do_simulation(*arguments)
             self._healthy = None
 
-        def set_state(self, *arguments: Any) -> None:
+        def set_state(self, *arguments: object) -> None:
             super().set_state(*arguments)
             self._healthy = None
 
@@ -253,7 +254,7 @@ def _remedy(error: BaseException) -> str:
     return ""
 
 
-def _check_spaces(env: gym.Env[Any, Any], where: str) -> None:
+def _check_spaces(env: Env, where: str) -> None:
     try:
         box(env.observation_space, f"{where}: observations")
         action_box(env.action_space, f"{where}: actions")
@@ -261,7 +262,7 @@ def _check_spaces(env: gym.Env[Any, Any], where: str) -> None:
         env.close()
 
 
-def box(space: gym.Space[Any], what: str) -> gym.spaces.Box:
+def box(space: Space, what: str) -> gym.spaces.Box:
     """Return `space` if it is a flat float Box, else raise an OffbenchError that begins with `what`."""
     if isinstance(space, gym.spaces.Box) and not np.issubdtype(space.dtype, np.floating) and len(space.shape) == 1:
         raise OffbenchError(f"{what} must be floats, not {space}; convert them and their space to float32")
@@ -273,12 +274,12 @@ def box(space: gym.Space[Any], what: str) -> gym.spaces.Box:
     return space
 
 
-def _flattening(space: gym.Space[Any], what: str) -> str:
+def _flattening(space: Space, what: str) -> str:
     """Return what makes a flat Box of floats of a space of observations; there is nothing like it for actions."""
     if "observation" not in what:
         return "offbench's algorithms choose continuous actions, one number for each dimension"
     try:
-        flat: gym.Space[Any] = gym.spaces.flatten_space(space)
+        flat: Space = gym.spaces.flatten_space(space)
     except (NotImplementedError, ValueError):
         flat = space
     if not isinstance(flat, gym.spaces.Box):
@@ -287,7 +288,7 @@ def _flattening(space: gym.Space[Any], what: str) -> str:
     return f"wrap the environment in FlattenObservation{floats} and record the dataset again"
 
 
-def action_box(space: gym.Space[Any], what: str) -> gym.spaces.Box:
+def action_box(space: Space, what: str) -> gym.spaces.Box:
     """Return `space` if it is a flat float Box with bounds that actions can be scaled by, else raise OffbenchError."""
     actions = box(space, what)
     if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):

@@ -15,13 +15,15 @@ import tomllib
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import damage, read_text
 from offbench.common.settings import build, setting
 from offbench.envs.environments import env_spec
 from offbench.envs.margin_rule import ADDED, EARLIER, with_margin
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Recipe:
     contact_margin: str = setting(
         EARLIER, "contact margins of MuJoCo before 3.5 (max) or since (sum)", choices=(EARLIER, ADDED)
     )
-    env_kwargs: tuple[tuple[str, Any], ...] = ()
+    env_kwargs: tuple[tuple[str, object], ...] = ()
     sac: SACSettings = dataclasses.field(default_factory=SACSettings)
     measure: Measurement = dataclasses.field(default_factory=Measurement)
     folder: Path | None = dataclasses.field(default=None, compare=False, metadata={"internal": True})
@@ -119,13 +121,14 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
     except FileNotFoundError:
         raise OffbenchError(f"no recipe file {path}; write one, or name a shipped one: {', '.join(names())}") from None
     values.setdefault("name", path.stem if folder is None else folder.name)
-    values["env_kwargs"] = _kwargs(values.pop("env_kwargs", {}), where)
-    tables = {"sac": SACSettings, "measure": Measurement}
-    parts: dict[str, Any] = {
-        key: build(cls, _table(values.pop(key, {}), key, where), f"{where}: [{key}]") for key, cls in tables.items()
-    }
-    kwargs = values.pop("env_kwargs")
-    recipe = dataclasses.replace(build(Recipe, values, where), env_kwargs=kwargs, folder=folder, **parts)
+
+    def table(cls: type[T], key: str) -> T:
+        return build(cls, _table(values.pop(key, {}), key, where), f"{where}: [{key}]")
+
+    kwargs = _kwargs(values.pop("env_kwargs", {}), where)
+    sac, measure = table(SACSettings, "sac"), table(Measurement, "measure")
+    recipe = build(Recipe, values, where)
+    recipe = dataclasses.replace(recipe, env_kwargs=kwargs, folder=folder, sac=sac, measure=measure)
     _check(recipe, where)
     shipped_one = load_recipe(recipe.name) if folder is None and recipe.name in names() else recipe
     if recipe.env_id != shipped_one.env_id:
@@ -136,13 +139,13 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
     return recipe
 
 
-def _table(value: Any, key: str, where: str) -> dict[str, Any]:
+def _table(value: object, key: str, where: str) -> dict[str, object]:
     if not isinstance(value, dict):
         raise OffbenchError(f"{where}: {key} must be a table, not {value!r}")
     return value
 
 
-def _kwargs(value: Any, where: str) -> tuple[tuple[str, Any], ...]:
+def _kwargs(value: object, where: str) -> tuple[tuple[str, object], ...]:
     table = _table(value, "env_kwargs", where)
     try:
         json.dumps(table)

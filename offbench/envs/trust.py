@@ -11,7 +11,6 @@ import importlib
 import os
 import re
 from collections.abc import Iterator
-from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
@@ -90,7 +89,7 @@ def check_code(spec: EnvSpec) -> None:
             plain.check(kwargs, f"the arguments of {name}")
 
 
-def _check_class(entry_point: Any, base: type) -> None:
+def _check_class(entry_point: object, base: type) -> None:
     names = ENTRY_POINT.fullmatch(str(entry_point))
     if names is None:
         raise OffbenchError(f"its entry point {str(entry_point)[:LONGEST]!r} does not have the form module:Class")
@@ -119,7 +118,7 @@ class _Plain:
     def __init__(self) -> None:
         self.count = 0
 
-    def check(self, value: Any, where: str, depth: int = 0) -> None:
+    def check(self, value: object, where: str, depth: int = 0) -> None:
         self.count += 1
         if self.count > MOST or depth > DEEPEST:
             raise OffbenchError(f"{where} are too many or too deeply nested; {REMEDY}")

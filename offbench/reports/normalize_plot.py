@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from offbench.analysis.results import read_results
 from offbench.analysis.statistics import curve
 from offbench.common.plotting import figure, picture_file, save
@@ -30,7 +32,7 @@ def plot_curves(runs: str | Path, path: str | Path) -> Path:
                 label=method.label,
             )
             if points and points[0].low is not None:
-                low, high = [p.low for p in points], [p.high for p in points]
+                low, high = np.array([(p.low, p.high) for p in points], float).T
                 axes.fill_between(steps, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
             unit = "normalized score" if task.reference else "return"
             axes.set(title=task.name, xlabel="updates", ylabel=unit)

@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +31,7 @@ class FunctionPolicy:
     name: str
     low: Array
     high: Array
-    function: Callable[[Array], Any]
+    function: Callable[[Array], object]
 
     def needs_noise(self, deterministic: bool) -> bool:
         """Return False: the function draws what it needs itself."""

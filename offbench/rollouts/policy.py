@@ -21,7 +21,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -30,14 +30,16 @@ from safetensors.numpy import load, save
 
 from offbench.common.arrays import Array, content_sha256
 from offbench.common.errors import OffbenchError
-from offbench.common.files import damage, read_bytes, write_bytes
+from offbench.common.files import JsonObject, damage, read_bytes, write_bytes
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from offbench.algorithm.interface import PolicyParts  # brings PyTorch, which processes that play do without
 
 KINDS = ("tanh", "squashed_gaussian", "gaussian", "best_by_q", "uniform")
 Layers = tuple[tuple[Array, Array], ...]
-ACTIVATIONS: dict[str, Callable[[Array], Any]] = {  # in place
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {  # in place
     "relu": lambda x: np.maximum(x, 0.0, out=x),
     "tanh": lambda x: np.tanh(x, out=x),
 }
@@ -79,7 +81,7 @@ class Policy:
     low: Array
     high: Array
     env_id: str
-    origin: dict[str, Any] = dataclasses.field(default_factory=dict)
+    origin: JsonObject = dataclasses.field(default_factory=dict)
     critic: Layers = ()
     samples: int = 1
     activation: str = "relu"
@@ -206,7 +208,7 @@ class Policy:
         write_bytes(path, self.to_bytes())
 
 
-def _clip(x: Array, low: Any, high: Any) -> Array:
+def _clip(x: Array, low: Array | float, high: Array | float) -> Array:
     """`np.clip`, whose checks cost several times as much as a few lanes' numbers."""
     clipped: Array = np.minimum(np.maximum(x, low), high)
     return clipped
@@ -268,7 +270,7 @@ def from_bytes(data: bytes) -> Policy:
     return policy
 
 
-def _header(data: bytes) -> dict[str, Any]:
+def _header(data: bytes) -> JsonObject:
     """Return the JSON that the safetensors header carries for us ({} if there is none)."""
     length = int.from_bytes(data[:8], "little")
     try:
@@ -307,7 +309,7 @@ def check_networks(parts: Policy | PolicyParts, observations: int, actions: int)
         _check_layers(parts.critic, observations + actions, 1)
 
 
-def _check_layers(layers: Sequence[tuple[Any, Any]], inputs: int, outputs: int) -> None:
+def _check_layers(layers: Sequence[tuple[Array, Array] | tuple[Tensor, Tensor]], inputs: int, outputs: int) -> None:
     if not layers:
         raise ValueError("it has no layers")
     width = inputs

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from typing import Any
+from typing import SupportsFloat, TypeVar, TypeVarTuple
 
 import gymnasium as gym
 import numpy as np
@@ -31,10 +31,12 @@ from offbench.common.errors import SHOW_TRACEBACK, OffbenchError
 from offbench.common.processes import closing, quiet_start, start_errors, start_worker
 from offbench.common.scores import interval
 from offbench.common.seeds import Purpose
-from offbench.envs.environments import LONGEST, make_env, reason, time_limit
+from offbench.envs.environments import LONGEST, Env, make_env, reason, time_limit
 from offbench.rollouts.function_policy import MARK, FunctionPolicy, from_mark
 from offbench.rollouts.policy import Policy, from_bytes
 
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
 LANES = 16  # episodes that share a policy forward
 TASK = 16  # episodes that travel together
 LAST_TASK = 4  # where a recording ends, fewer travel together
@@ -87,7 +89,6 @@ class Task:
     stream: tuple[int, ...]
     indices: tuple[int, ...]
     deterministic: bool
-    summary: bool
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def summary(outcomes: list[Outcome], prefix: str = "") -> dict[str, float]:
 class _Lane:
     """One environment in the middle of an episode."""
 
-    def __init__(self, env: gym.Env[Any, Any], policy: Policy | FunctionPolicy, task: Task, slot: int) -> None:
+    def __init__(self, env: Env, policy: Policy | FunctionPolicy, task: Task, slot: int) -> None:
         index = task.indices[slot]
         self.env, self.policy, self.slot = env, policy, slot
         self.seed = seeds.integer(task.seed, Purpose.RESET, *task.stream, index)
@@ -150,7 +151,7 @@ class _Lane:
         return Episode(self.seed, observations, np.array(self.actions), rewards, *ends)
 
 
-def reset(env: gym.Env[Any, Any], seed: int | None) -> Array:
+def reset(env: Env, seed: int | None) -> Array:
     """Return a copy of an episode's first observation. Raises OffbenchError if the environment fails; it is named."""
     try:
         return _observation(env, env.reset(seed=seed)[0])
@@ -158,7 +159,7 @@ def reset(env: gym.Env[Any, Any], seed: int | None) -> Array:
         raise _failed(env, error) from error
 
 
-def step(env: gym.Env[Any, Any], action: Array) -> tuple[Array, float, bool, bool]:
+def step(env: Env, action: Array) -> tuple[Array, float, bool, bool]:
     """Return a copy of the next observation, the reward, whether it terminated and whether it was truncated.
 
     Raises:
@@ -171,34 +172,36 @@ def step(env: gym.Env[Any, Any], action: Array) -> tuple[Array, float, bool, boo
         raise _failed(env, error) from error
 
 
-def _observation(env: gym.Env[Any, Any], observation: Any) -> Array:
+def _observation(env: Env, observation: object) -> Array:
     copy = np.array(observation)  # environments may reuse their array
     if copy.shape != env.observation_space.shape:
         raise ValueError(f"an observation has shape {copy.shape}, its space {env.observation_space.shape}")
     return copy
 
 
-def _check_finite(env: gym.Env[Any, Any], observations: Array, rewards: Array | float) -> None:
+def _check_finite(env: Env, observations: Array, rewards: Array | float) -> None:
     for name, values in (("observation", observations), ("reward", rewards)):
         if not np.isfinite(values).all():
             raise _failed(env, ValueError(f"{name} with NaN or infinite numbers"))
 
 
-class Named(gym.Wrapper[Any, Any, Any, Any]):
+class Named(gym.Wrapper[Array, Array, Array, Array]):
     """An environment whose failures, NaN among them, are OffbenchErrors that name it."""
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[Array, dict[str, object]]:
         """Reset the environment; `options` are not used."""
         return reset(self.env, seed), {}
 
-    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, object]]:
         """Take a step."""
         observation, reward, *ends = step(self.env, action)
         _check_finite(self.env, observation, reward)
         return observation, reward, *ends, {}  # type: ignore[return-value]
 
 
-def number(reward: Any) -> float:
+def number(reward: SupportsFloat) -> float:
     """Return a reward as a number; an array of one element counts as one. Raises ValueError for any other."""
     if isinstance(reward, np.ndarray):
         if reward.size != 1:
@@ -207,7 +210,7 @@ def number(reward: Any) -> float:
     return float(reward)
 
 
-def _failed(env: gym.Env[Any, Any], error: Exception) -> Exception:
+def _failed(env: Env, error: Exception) -> Exception:
     """Return what to raise for an exception of an environment."""
     if isinstance(error, OffbenchError | MemoryError):
         return error
@@ -215,18 +218,27 @@ def _failed(env: gym.Env[Any, Any], error: Exception) -> Exception:
     return OffbenchError(f"the environment {_name(env)} failed: {what} ({SHOW_TRACEBACK})")
 
 
-def _name(env: gym.Env[Any, Any]) -> str:
+def _name(env: Env) -> str:
     return env.spec.id if env.spec else type(env.unwrapped).__name__
 
 
-def play(task: Task) -> list[Episode] | list[Outcome]:
+def play(task: Task) -> list[Episode]:
     """Play a task's episodes and return them in its order."""
+    return _play(task, lambda episode: episode)
+
+
+def play_outcomes(task: Task) -> list[Outcome]:
+    """Play a task's episodes and return what evaluations keep of them."""
+    return _play(task, lambda episode: Outcome(float(episode.rewards.sum()), len(episode)))
+
+
+def _play(task: Task, keep: Callable[[Episode], T]) -> list[T]:
     policy = _policy(task.policy)
     noisy = policy.needs_noise(task.deterministic)
     envs = kept_envs(task.spec, min(LANES, len(task.indices)))
     waiting = iter(range(len(task.indices)))
     lanes = [_Lane(env, policy, task, slot) for env, slot in zip(envs, waiting, strict=False)]
-    done: list[Any] = [None] * len(task.indices)
+    done: dict[int, T] = {}
     while lanes:
         if closing():
             raise CancelledError
@@ -239,12 +251,12 @@ def play(task: Task) -> list[Episode] | list[Outcome]:
             if episode is None:
                 going.append(lane)
                 continue
-            done[lane.slot] = Outcome(float(episode.rewards.sum()), len(episode)) if task.summary else episode
+            done[lane.slot] = keep(episode)
             slot = next(waiting, None)
             if slot is not None:
                 going.append(_Lane(lane.env, policy, task, slot))
         lanes = going
-    return done
+    return [done[slot] for slot in range(len(task.indices))]
 
 
 @functools.lru_cache(maxsize=4)
@@ -253,11 +265,11 @@ def _policy(data: bytes) -> Policy | FunctionPolicy:
 
 
 @functools.lru_cache(maxsize=4)
-def _pool_of_envs(spec: str) -> list[gym.Env[Any, Any]]:
+def _pool_of_envs(spec: str) -> list[Env]:
     return []
 
 
-def kept_envs(spec: str, count: int) -> list[gym.Env[Any, Any]]:
+def kept_envs(spec: str, count: int) -> list[Env]:
     """Return `count` environments of this process, made once and kept."""
     pool = _pool_of_envs(spec)
     while len(pool) < count:
@@ -291,11 +303,7 @@ class Rollouts:
             self._closing.value = 1  # saves a second of episodes that are not needed
             self._pool.shutdown(wait=True, cancel_futures=True)
 
-    def submit(self, task: Task) -> Future[Any]:
-        """Start a task; its result is the list that `play` returns."""
-        return self.call(play, task)
-
-    def call(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    def call(self, function: Callable[[*Ts], T], *arguments: *Ts) -> Future[T]:
         """Start a module's function in a worker process, or run it now if there is none."""
         if self._pool:
             with quiet_start():
@@ -303,7 +311,7 @@ class Rollouts:
                     return self._pool.submit(function, *arguments)
                 except BrokenProcessPool:
                     raise _worker_died() from None
-        future: Future[Any] = Future()
+        future: Future[T] = Future()
         future.set_result(function(*arguments))
         return future
 
@@ -317,7 +325,7 @@ class Rollouts:
                 starts that is unlikely to be needed.
         """
         data, ahead = policy.to_bytes(), 1 if not self._pool else 2 * self.workers + 1
-        pending: collections.deque[Future[Any]] = collections.deque()
+        pending: collections.deque[Future[list[Episode]]] = collections.deque()
         begun = done = steps = 0
         try:
             while True:
@@ -330,7 +338,7 @@ class Rollouts:
                             break
                         size = min(size, max(LAST_TASK, math.ceil(wanted / ahead)))
                     indices = tuple(range(begun, begun + size))
-                    pending.append(self.submit(Task(self.spec, data, seed, stream, indices, False, False)))
+                    pending.append(self.call(play, Task(self.spec, data, seed, stream, indices, False)))
                     begun += size
                 for episode in result(pending.popleft()):
                     done, steps = done + 1, steps + len(episode)
@@ -343,21 +351,15 @@ class Rollouts:
         self, policy: Policy | FunctionPolicy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
     ) -> Future[list[Outcome]]:
         """Start `count` evaluation episodes; the future gives their returns and lengths in order."""
-        tasks = self.outcome_tasks(policy, seed, stream, count, deterministic)
-        return _gather([self.submit(task) for task in tasks])
-
-    def outcome_tasks(
-        self, policy: Policy | FunctionPolicy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
-    ) -> list[Task]:
-        """Cut an evaluation into tasks, one for each worker if there are enough episodes."""
-        data, parts = policy.to_bytes(), max(1, min(self.workers, count // 2))
-        chunks = np.array_split(np.arange(count), parts)
-        return [
-            Task(self.spec, data, seed, stream, tuple(int(i) for i in chunk), deterministic, True) for chunk in chunks
-        ]
+        data, parts = policy.to_bytes(), max(1, min(self.workers, count // 2))  # a task per worker, if they suffice
+        tasks = (
+            Task(self.spec, data, seed, stream, tuple(chunk.tolist()), deterministic)
+            for chunk in np.array_split(np.arange(count), parts)
+        )
+        return _gather([self.call(play_outcomes, task) for task in tasks])
 
 
-def result(future: Future[Any]) -> Any:
+def result(future: Future[T]) -> T:
     """Return a task's result; a worker that was killed becomes a clear line."""
     try:
         return future.result()
@@ -371,13 +373,13 @@ def _worker_died() -> OffbenchError:
     )
 
 
-def _gather(futures: Sequence[Future[Any]]) -> Future[list[Outcome]]:
+def _gather(futures: Sequence[Future[list[Outcome]]]) -> Future[list[Outcome]]:
     """Return one future for the results of several, end to end."""
     whole: Future[list[Outcome]] = Future()
     left = [len(futures)]
     lock = threading.Lock()
 
-    def arrived(future: Future[Any]) -> None:
+    def arrived(future: Future[list[Outcome]]) -> None:
         with lock:
             left[0] -= 1
             if whole.done():

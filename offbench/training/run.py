@@ -32,6 +32,7 @@ from offbench.common.files import (
     write_bytes,
     write_json,
 )
+from offbench.common.provenance import Hardware, MadeWith
 from offbench.common.settings import read_back
 from offbench.training.registry import current_settings
 from offbench.training.source_code import changes
@@ -58,8 +59,8 @@ class Session:
     step: int = 0
     device: str = ""
     precision: str = ""
-    versions: dict[str, Any] = field(default_factory=dict)
-    hardware: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    hardware: Hardware = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,8 +93,8 @@ class RunConfig:
     command: str = ""
     device: str = ""
     precision: str = ""
-    versions: dict[str, Any] = field(default_factory=dict)
-    hardware: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    hardware: Hardware = field(default_factory=dict)
     code: dict[str, str] = field(default_factory=dict)
     sessions: tuple[Session, ...] = ()
     label: str = ""
@@ -218,11 +219,11 @@ class Run:
                     else:
                         path.unlink()
 
-    def begin(self, step: int, steps: int, made: Mapping[str, Any]) -> None:
+    def begin(self, step: int, steps: int, made: MadeWith) -> None:
         """Note in config.json that the run is trained from `step` to `steps`, and with what, if that has changed.
 
         Args:
-            made: device, precision, versions and hardware (offbench.common.provenance.made_with).
+            made: from offbench.common.provenance.made_with.
         """
         config, written = self.config(), read_json(self.config_path, REPEAT)
         changed = dict(written, steps=max(steps, config.steps))

@@ -71,7 +71,7 @@ def plain(env_id: str) -> gym.Env:
 def test_an_episode_equals_one_played_by_hand_with_gymnasium() -> None:
     """Episode 11 of a task of 20, replayed alone in an environment of its own from its seeds."""
     spec, policy = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5")
-    episodes = play(Task(spec, policy.to_bytes(), 5, (2,), tuple(range(20)), False, False))
+    episodes = play(Task(spec, policy.to_bytes(), 5, (2,), tuple(range(20)), False))
     episode = episodes[11]
     assert isinstance(episode, Episode)
     env = plain("Hopper-v5")
@@ -90,9 +90,9 @@ def test_an_episode_equals_one_played_by_hand_with_gymnasium() -> None:
 def test_more_episodes_than_lanes_keep_their_order() -> None:
     spec, policy = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5")
     indices = tuple(range(LANES * 2 + 3))
-    together = play(Task(spec, policy.to_bytes(), 0, (), indices, False, False))
+    together = play(Task(spec, policy.to_bytes(), 0, (), indices, False))
     for index in indices[::5]:
-        (alone,) = play(Task(spec, policy.to_bytes(), 0, (), (index,), False, False))
+        (alone,) = play(Task(spec, policy.to_bytes(), 0, (), (index,), False))
         assert isinstance(alone, Episode)
         np.testing.assert_array_equal(alone.observations, together[index].observations)  # type: ignore[union-attr]
 
@@ -133,8 +133,8 @@ def test_no_more_episodes_are_played_than_are_likely_to_be_wanted(
 ) -> None:
     spec, policy, enough = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5"), 8000
     begun: list[int] = []
-    submit = Rollouts.submit
-    monkeypatch.setattr(Rollouts, "submit", lambda self, task: begun.extend(task.indices) or submit(self, task))
+    call = Rollouts.call
+    monkeypatch.setattr(Rollouts, "call", lambda self, do, task: begun.extend(task.indices) or call(self, do, task))
     found = []
     for told in (None, enough):
         begun.clear()
@@ -164,7 +164,7 @@ def test_sigterm_to_all_processes_leaves_evaluations_to_the_parent() -> None:
     """Slurm sends it so; the parent saves a checkpoint, and that waits for the evaluations under way."""
     policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     with Rollouts(POLE, workers=2) as rollouts:
-        result(rollouts.submit(Task(POLE, policy.to_bytes(), 0, (), (0,), True, True)))
+        result(rollouts.outcomes(policy, 0, (), 1, True))
         future = rollouts.outcomes(policy, 0, (), 400, False)
         assert rollouts._pool is not None
         for pid in rollouts._pool._processes:
@@ -190,11 +190,10 @@ def test_a_killed_worker_ends_those_beside_it() -> None:
 def test_a_killed_worker_is_a_clear_error() -> None:
     with Rollouts(env_spec("InvertedPendulum-v5"), workers=1) as rollouts:
         policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
-        task = Task(rollouts.spec, policy.to_bytes(), 0, (), tuple(range(4)), True, True)
-        result(rollouts.submit(task))
+        result(rollouts.outcomes(policy, 0, (), 4, True))
         assert rollouts._pool is not None
         (pid,) = rollouts._pool._processes
-        future = rollouts.submit(Task(rollouts.spec, policy.to_bytes(), 0, (), tuple(range(5000)), False, True))
+        future = rollouts.outcomes(policy, 0, (), 5000, False)
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(OffbenchError, match="worker process died"):
             result(future)
@@ -203,9 +202,9 @@ def test_a_killed_worker_is_a_clear_error() -> None:
 def test_leaving_the_pool_ends_what_is_being_played() -> None:
     policy = uniform(*BOUNDS, 11, "Hopper-v5")
     with Rollouts(env_spec("Hopper-v5"), workers=1) as rollouts:
-        few, many = (Task(rollouts.spec, policy.to_bytes(), 0, (), tuple(range(n)), False, True) for n in (1, 10**6))
-        assert len(result(rollouts.submit(few))) == 1
-        future = rollouts.submit(many)
+        assert len(result(rollouts.outcomes(policy, 0, (), 1, False))) == 1
+        many = Task(rollouts.spec, policy.to_bytes(), 0, (), tuple(range(10**6)), False)
+        future = rollouts.call(play, many)
         while not future.running():
             time.sleep(0.01)
     assert isinstance(future.exception(timeout=0), CancelledError)

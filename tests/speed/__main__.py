@@ -69,7 +69,7 @@ def line(found: dict[str, Any]) -> list[str]:
 
 def page(results: list[dict[str, Any]], grown: list[tuple[str, dict[str, Any]]]) -> str:
     """Return the page: the fixed text with this run's tables in it."""
-    made = hardware()["hardware"]
+    made = hardware()
     pins = (PEERS.parent.parent / "pins.txt").read_text(encoding="utf-8").split()
     peers = ", ".join(pin.replace("==", " ") for pin in pins if pin.startswith(("d3rlpy", "jax=", "optax")))
     where = (
@@ -130,7 +130,7 @@ def main() -> None:
                 grown.append((what, measure(row, arguments.quick)))
                 print(row.name, what, f"{grown[-1][1]['ratio']:.2f}", flush=True)
     if not arguments.quick and not arguments.only:
-        path = DOCS / f"benchmarks-{hardware()['hardware']['vectors'].lower()}.md"
+        path = DOCS / f"benchmarks-{hardware()['vectors'].lower()}.md"
         write_bytes(path, page(results, grown).encode())
         missed = [found["name"] for found in results if found["at_least"] and found["ratio"] < found["at_least"]]
         print(f"docs/{path.name} written; targets missed: {', '.join(missed) or 'none'}")

@@ -24,7 +24,7 @@ from offbench.common.provenance import hardware, has_bfloat16
 from offbench.common.tables import markdown
 from offbench.envs.environments import make_env
 from offbench.envs.recipes import load_recipe
-from offbench.rollouts.rollouts import LANES, Episode, Task, play
+from offbench.rollouts.rollouts import LANES, Task, play
 from offbench.training.captured_update import RECORDED
 from tests.speed.__main__ import DOCS
 from tests.speed.sides import ENV, stack_of
@@ -42,8 +42,8 @@ def recording() -> dict[str, float]:
     ladder = read_ladder(recipe.folder / "behaviour")
     assert ladder is not None
     policy = ladder.load(ladder.role("medium")).to_bytes()
-    task = Task(recipe.env_spec(), policy, 0, (), tuple(range(LANES)), False, False)
-    episodes = [episode for episode in play(task) if isinstance(episode, Episode)]
+    task = Task(recipe.env_spec(), policy, 0, (), tuple(range(LANES)), False)
+    episodes = play(task)
     env = make_env(task.spec)
     inner: Any = env.unwrapped
     model, data, skip = inner.model, inner.data, inner.frame_skip
@@ -134,7 +134,7 @@ def main() -> None:
             found += rows(f"an update of {algorithm}, {precision}", "ms", update(algorithm, precision))
     text = "\n".join(markdown(["of", "part", "takes", "share"], found)) + "\n"
     print(text)
-    write_bytes(DOCS / "results" / f"profile-{hardware()['hardware']['vectors'].lower()}.md", text.encode())
+    write_bytes(DOCS / "results" / f"profile-{hardware()['vectors'].lower()}.md", text.encode())
 
 
 if __name__ == "__main__":
