@@ -20,7 +20,6 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,10 +27,10 @@ from offbench.agents.ladder import MEDIUM, MEDIUM_AT_MOST, Ladder, read_ladder
 from offbench.agents.medium_replay import replay_episodes, save_replay
 from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common.errors import OffbenchError
-from offbench.common.files import csv_bytes, damage, disk_errors, read_json, write_bytes, write_json
+from offbench.common.files import JsonObject, csv_bytes, damage, disk_errors, read_json, write_bytes, write_json
 from offbench.common.provenance import versions
 from offbench.common.seeds import Purpose
-from offbench.envs.environments import make_env
+from offbench.envs.environments import make_env, spaces_of
 from offbench.envs.recipes import Recipe
 from offbench.rollouts.policy import Policy, load_policy, uniform
 from offbench.rollouts.rollouts import MEASURES, Outcome, Rollouts, result, summary
@@ -66,7 +65,7 @@ class RungEvaluator:
         self.screened_within: dict[int, float] = {}  # mean returns
         self.measured: dict[int, dict[str, float]] = {}
 
-        self._earlier: dict[str, dict[str, Any]] = {"screened": {}, "measured": {}}  # by the step as text
+        self._earlier: dict[str, JsonObject] = {"screened": {}, "measured": {}}  # by the step as text
 
     def resume(self) -> None:
         """Let what an earlier call measured in this folder, with the same packages and number of episodes, be reused.
@@ -81,11 +80,11 @@ class RungEvaluator:
             if table["made"] == self._made():
                 self._earlier = {name: dict(table[name]) for name in self._earlier}
 
-    def _save(self, kind: str, step: int, value: Any) -> None:
+    def _save(self, kind: str, step: int, value: float | dict[str, float]) -> None:
         self._earlier[kind][str(step)] = value
         write_json(self.folder.path / MEASURED, {"made": self._made(), **self._earlier})
 
-    def _made(self) -> dict[str, Any]:
+    def _made(self) -> dict[str, str | int]:
         episodes = self.folder.recipe.measure.rung_episodes
         return {name: versions()[name] for name in ("mujoco", "gymnasium", "numpy")} | {"episodes": episodes}
 
@@ -113,10 +112,7 @@ class RungEvaluator:
 
     def run(self, policy: Policy, stream: tuple[int, ...], count: int, deterministic: bool = False) -> list[Outcome]:
         """Play evaluation episodes."""
-        outcomes: list[Outcome] = result(
-            self.rollouts.outcomes(policy, self.folder.seed, stream, count, deterministic)
-        )
-        return outcomes
+        return result(self.rollouts.outcomes(policy, self.folder.seed, stream, count, deterministic))
 
     def estimate(self, step: int) -> float:
         """Return the return of a policy, as measured, or as screened if it was not measured."""
@@ -272,13 +268,10 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
 
 def random_reference(recipe: Recipe, seed: int, rollouts: Rollouts) -> dict[str, float]:
     """Measure the return of uniform actions over the recipe's `reference_episodes`: the reference's 0."""
-    env = make_env(recipe.env_spec())
-    space, dim = env.action_space, env.observation_space.shape
-    env.close()
-    assert dim is not None
-    policy = uniform(space.low, space.high, dim[0], recipe.env_id)  # type: ignore[attr-defined]
+    observations, actions = spaces_of(make_env(recipe.env_spec()), recipe.env_id)
+    policy = uniform(actions.low, actions.high, observations.shape[0], recipe.env_id)
     episodes = recipe.measure.reference_episodes
-    outcomes: list[Outcome] = result(rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 0), episodes, False))
+    outcomes = result(rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 0), episodes, False))
     return summary(outcomes) | {"episodes": episodes}
 
 
@@ -288,7 +281,7 @@ def _write(
     rows: list[dict[str, float]],
     evaluator: RungEvaluator,
     roles: dict[int, str],
-    info: dict[str, Any],
+    info: JsonObject,
 ) -> None:
     """Write the ladder to a temporary folder, then rename it; ladder.json, written last, says it is complete."""
     temporary = out.with_name(f".{out.name}.partial")
@@ -313,7 +306,7 @@ def _write(
 
 def _table(
     folder: TrainingFolder, rows: list[dict[str, float]], evaluator: RungEvaluator, roles: dict[int, str]
-) -> Iterator[list[Any]]:
+) -> Iterator[list[str | float]]:
     """Yield a row for every rung, and for the policies within segments that were measured.
 
     Returns are as measured where they were measured, as screened elsewhere; `episodes` says which.
@@ -325,7 +318,7 @@ def _table(
     measured = {step for step in evaluator.measured if step <= max(screened)}
     for step in sorted(screened.keys() | measured):
         hours = round(float(np.interp(step, list(screened), times)), 4)
-        values: dict[str, Any] = {"step": step, "hours": hours, **screened.get(step, {})}
+        values: dict[str, str | float] = {"step": step, "hours": hours, **screened.get(step, {})}
         values |= evaluator.measured.get(step, {})
         values |= {"role": roles.get(step, ""), "policy": folder.policy(step).name if step in roles else ""}
         yield [values[key] for key in COLUMNS]

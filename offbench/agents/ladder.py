@@ -14,12 +14,11 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from offbench.common.errors import OffbenchError
-from offbench.common.files import damage, read_json, regular
+from offbench.common.files import JsonObject, damage, read_json, regular
 from offbench.common.scores import normalize
 from offbench.envs.environments import same_environment
 from offbench.envs.recipes import Recipe, load_recipe, names
@@ -53,7 +52,7 @@ class Ladder:
     """A ladder's folder, read."""
 
     folder: Path
-    info: dict[str, Any]
+    info: JsonObject
     rungs: tuple[Rung, ...]
 
     @property

@@ -10,10 +10,11 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
@@ -63,10 +64,10 @@ def _cut(arrays: dict[str, Array], stream: int) -> Iterator[Piece]:
         first = last + 1
 
 
-def save_replay(path: Path, pieces: Iterator[Piece]) -> dict[str, Any]:
+def save_replay(path: Path, pieces: Iterator[Piece]) -> dict[str, int | str]:
     """Write episodes to one compressed HDF5 file; return its transitions, episodes and SHA-256."""
     whole = list(pieces)
-    arrays: dict[str, Any] = {
+    arrays: dict[str, Array] = {
         "observations": np.concatenate([p.observations for p in whole]).astype(np.float32),
         "actions": np.concatenate([p.actions for p in whole]).astype(np.float32),
         "rewards": np.concatenate([p.rewards for p in whole]).astype(np.float32),
@@ -84,7 +85,7 @@ def save_replay(path: Path, pieces: Iterator[Piece]) -> dict[str, Any]:
     return {"transitions": len(arrays["rewards"]), "episodes": len(whole), "sha256": sha256(data.getvalue())}
 
 
-def load_replay(path: Path, expected_sha256: str, low: Array, high: Array, dtype: Any) -> Iterator[Episode]:
+def load_replay(path: Path, expected_sha256: str, low: Array, high: Array, dtype: npt.DTypeLike) -> Iterator[Episode]:
     """Yield the recorded episodes, actions in the environment's bounds, observations in its precision.
 
     Raises:

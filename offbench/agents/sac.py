@@ -19,7 +19,7 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -36,6 +36,7 @@ from offbench.common import checkpoints, seeds
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import (
+    JsonObject,
     csv_bytes,
     disk_errors,
     exclusive_lock,
@@ -48,7 +49,7 @@ from offbench.common.interrupts import stops_noted
 from offbench.common.progress import Progress, duration
 from offbench.common.provenance import hardware, versions
 from offbench.common.seeds import Purpose
-from offbench.envs.environments import make_env
+from offbench.envs.environments import Env, make_env
 from offbench.envs.recipes import Recipe, SACSettings
 from offbench.rollouts.policy import Policy
 from offbench.rollouts.rollouts import MEASURES, Named, Rollouts, summary
@@ -99,7 +100,7 @@ def _check_identity(folder: TrainingFolder) -> None:
         )
 
 
-def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
+def _flat(table: JsonObject) -> JsonObject:
     """Return {"sac.steps": ...} of {"sac": {"steps": ...}}."""
     inner = {
         f"{key}.{name}": v for key, value in table.items() if isinstance(value, dict) for name, v in value.items()
@@ -172,7 +173,7 @@ def _make_sac(recipe: Recipe, spec: str, buffer_size: int) -> SAC:
     settings = recipe.sac
     cycle, gradient_steps = settings.cycle()
 
-    def single() -> gym.Env[Any, Any]:
+    def single() -> Env:
         # float32 halves the replay buffer; the medium-replay level keeps exactly what SAC saw
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # Gymnasium's remark on the bounds' precision
@@ -293,7 +294,7 @@ def _export(folder: TrainingFolder, model: SAC) -> Policy:
     return export_actor(model, folder.recipe.env_id, origin)
 
 
-def export_actor(model: SAC, env_id: str, origin: dict[str, Any]) -> Policy:
+def export_actor(model: SAC, env_id: str, origin: JsonObject) -> Policy:
     """Return SB3's SAC actor as a policy that needs neither SB3 nor PyTorch."""
     actor: Any = model.policy.actor
     linear = [layer for layer in actor.latent_pi if isinstance(layer, torch.nn.Linear)]

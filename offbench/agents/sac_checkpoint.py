@@ -22,7 +22,7 @@ from offbench.agents.training_folder import TRANSITIONS, TrainingFolder
 from offbench.common import checkpoints
 from offbench.common.arrays import Array
 from offbench.common.checkpoints import keep_newest, load_checkpoint, save_checkpoint
-from offbench.common.files import disk_errors
+from offbench.common.files import JsonObject, disk_errors
 
 OPTIMIZERS = ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer")
 
@@ -102,7 +102,7 @@ def restore(folder: TrainingFolder, model: SAC, start_segment: Callable[[int], N
     return 0.0
 
 
-def _state(model: SAC, seconds: float) -> dict[str, Any]:
+def _state(model: SAC, seconds: float) -> JsonObject:
     return {"step": model.num_timesteps, "n_updates": model._n_updates, "seconds": seconds}
 
 
@@ -177,7 +177,7 @@ def _replay_segment(model: SAC, arrays: dict[str, Array]) -> bool:
     return True
 
 
-def _restore_generators(model: SAC, generator: torch.Tensor, state: dict[str, Any]) -> None:
+def _restore_generators(model: SAC, generator: torch.Tensor, state: JsonObject) -> None:
     torch.set_rng_state(generator)
     numpy_state = state["numpy"]
     key = np.array(numpy_state["state"]["key"], np.uint32)

@@ -14,13 +14,12 @@ import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import regular
+from offbench.common.files import JsonObject, regular
 from offbench.rollouts.policy import ACTIVATIONS, Layers, Policy
 
 LARGEST = 2**30  # bytes of a member, unpacked
@@ -55,7 +54,7 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
     return Policy(kind, layers, zeros, zeros + 1, low, high, env_id, origin, activation=activation)
 
 
-def _read(path: Path) -> tuple[dict[str, Array], dict[str, Any]]:
+def _read(path: Path) -> tuple[dict[str, Array], JsonObject]:
     """Return the tensors of policy.pth and the plain settings of data. Raises what zipfile and torch raise."""
     import torch
 
@@ -113,7 +112,7 @@ def _sequence(tensors: Mapping[str, Array], name: str) -> Layers:
     return tuple(_layer(tensors, f"{name}.{index}") for index in sorted(int(match[1]) for match in matches if match))
 
 
-def _activation(path: Path, settings: Mapping[str, Any], default: str) -> str:
+def _activation(path: Path, settings: JsonObject, default: str) -> str:
     """Return the activation by the text of policy_kwargs, where SB3 repeats what it pickles."""
     kwargs = settings.get("policy_kwargs")
     text = str(kwargs.get("activation_fn", "")) if isinstance(kwargs, dict) else ""

@@ -15,13 +15,12 @@ import shlex
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from offbench.agents.ladder import BEHAVIOUR, Ladder, find_ladder
 from offbench.common.errors import OffbenchError
-from offbench.common.files import read_json, write_bytes, write_json
+from offbench.common.files import JsonObject, read_json, write_bytes, write_json
 from offbench.common.provenance import versions
 from offbench.common.scores import normalize
 from offbench.common.tables import markdown
@@ -97,7 +96,7 @@ def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
     return f"warning: content differs from the dataset card's, {reason}"
 
 
-def _keep_hashes(recipe: Recipe, facts: dict[str, dict[str, Any]], mujoco: str) -> None:
+def _keep_hashes(recipe: Recipe, facts: dict[str, JsonObject], mujoco: str) -> None:
     """Add the shipped card's content hashes of other MuJoCo versions to each level, if it describes the same ladder.
 
     medium-replay tells that: it comes from training, so its content is the same on every MuJoCo version.
@@ -132,7 +131,7 @@ def _recorded(recipe: Recipe, ladder: Ladder, level: str, collect: str) -> Summa
     return summary
 
 
-def _facts(recipe: Recipe, summary: Summary) -> dict[str, Any]:
+def _facts(recipe: Recipe, summary: Summary) -> JsonObject:
     meta, returns = summary.metadata, np.asarray(summary.returns)
     mean = float(returns.mean())
     d4rl = None
@@ -152,7 +151,7 @@ def _facts(recipe: Recipe, summary: Summary) -> dict[str, Any]:
     }
 
 
-def _text(recipe: Recipe, ladder: Ladder, facts: Mapping[str, Any], made: Mapping[str, str]) -> Iterator[str]:
+def _text(recipe: Recipe, ladder: Ladder, facts: JsonObject, made: Mapping[str, str]) -> Iterator[str]:
     info, references = ladder.info, ladder.info["references"]
     yield f"# {recipe.name}: {recipe.env_id}"
     command = f"`offbench card {recipe.name}`"
@@ -215,7 +214,7 @@ def _text(recipe: Recipe, ladder: Ladder, facts: Mapping[str, Any], made: Mappin
     yield from ("", "`offbench collect` prints whether the dataset that it recorded has the same content.")
 
 
-def _cells(level: str, values: Mapping[str, Any]) -> list[str]:
+def _cells(level: str, values: JsonObject) -> list[str]:
     spread = [_short(values[key]) for key in ("return", "std", "min", "max", "score", "d4rl_score")]
     return [
         level,

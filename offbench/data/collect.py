@@ -6,18 +6,16 @@ import functools
 import itertools
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from offbench.agents.build_ladder import random_reference
 from offbench.agents.ladder import BEHAVIOUR, MEDIUM, MEDIUM_AT_MOST, MEDIUM_LIMITS, NEAR, Ladder, Rung, find_ladder
 from offbench.agents.medium_replay import load_replay
 from offbench.common.errors import OffbenchError
-from offbench.common.files import sha256
+from offbench.common.files import JsonObject, sha256
 from offbench.common.processes import default_workers
 from offbench.common.progress import Progress
 from offbench.common.provenance import versions
@@ -27,7 +25,7 @@ from offbench.data.card import compare
 from offbench.data.levels import Part, full_size, parse_level, parse_mix, shares
 from offbench.data.other_references import warn_other_references
 from offbench.envs.contact_margins import model_of
-from offbench.envs.environments import make_env
+from offbench.envs.environments import make_env, spaces_of
 from offbench.envs.margin_rule import MARGIN, without_margin
 from offbench.envs.recipes import Recipe, load_recipe
 from offbench.rollouts.function_policy import FunctionPolicy
@@ -100,7 +98,7 @@ def collect(
         raise OffbenchError(f"steps must be at least 1, not {steps}")
     workers = default_workers(workers)
 
-    def prepare(ladder: Ladder | None) -> tuple[_Recording, list[Rung | None], list[int], dict[str, Any]]:
+    def prepare(ladder: Ladder | None) -> tuple[_Recording, list[Rung | None], list[int], JsonObject]:
         recording = _Recording(recipe, ladder, seed, workers, given)
         sources = [recording.source(part, accept) for part in parts]
         counts = _counts(recipe, ladder, parts, steps)
@@ -130,10 +128,10 @@ def collect(
     return dataset_id
 
 
-def _is(dataset_id: str, wanted: Mapping[str, Any]) -> bool:
+def _is(dataset_id: str, wanted: JsonObject) -> bool:
     """Return whether a dataset was recorded from what `wanted`, its metadata to be, says, on this physics."""
     recorded = minari_store.provenance(minari_store.read_metadata(dataset_id))
-    ours = json.loads(json.dumps(minari_store.provenance(dict(wanted))))  # as it was written: tuples are lists
+    ours = json.loads(json.dumps(minari_store.provenance(wanted)))  # as it was written: tuples are lists
     made = [{name: part.get("versions", {}).get(name) for name in PHYSICS} for part in (recorded, ours)]
     return all(recorded.get(key) == ours[key] for key in WHAT_IT_IS) and made[0] == made[1]
 
@@ -180,20 +178,12 @@ class _Recording:
         self.recipe, self._ladder, self.seed, self.workers = recipe, ladder, seed, workers
         self.spec = recipe.env_spec()
         env = make_env(self.spec)
-        self.observation_space: Any = env.observation_space
-        self.action_space: Any = env.action_space
         self.mujoco = model_of(env) is not None
-        env.close()
+        self.spaces = self.observation_space, self.action_space = spaces_of(env, recipe.env_id)
         self.given: BehaviourPolicy | None = None
         if given is not None:
-            space: Any = self.action_space
-            dim = int(np.prod(self.observation_space.shape or ()))
-            self.given = read_behaviour_policy(given, space.low, space.high, dim, recipe.env_id)
-
-    @property
-    def spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
-        """Of observations and actions."""
-        return self.observation_space, self.action_space
+            low, high = self.action_space.low, self.action_space.high
+            self.given = read_behaviour_policy(given, low, high, self.observation_space.shape[0], recipe.env_id)
 
     @property
     def ladder(self) -> Ladder:
@@ -202,7 +192,7 @@ class _Recording:
         return self._ladder
 
     @functools.cached_property
-    def references(self) -> dict[str, Any]:
+    def references(self) -> JsonObject:
         """The random and the expert reference; without a ladder the random one, measured here as a ladder's is."""
         if self._ladder:
             return dict(self._ladder.info["references"])
@@ -296,9 +286,9 @@ class _Recording:
         fraction = self.ladder.fraction(rung)
         return f"SAC's policy of training step {rung.step}, at {fraction:.2f} of the expert's return"
 
-    def describe(self, part: Part, rung: Rung | None, count: int) -> dict[str, Any]:
+    def describe(self, part: Part, rung: Rung | None, count: int) -> JsonObject:
         """Return a part's definition as measured, for the metadata."""
-        described: dict[str, Any] = {"source": part.source, "transitions": count}
+        described: JsonObject = {"source": part.source, "transitions": count}
         if part.source == "replay":
             medium = self.ladder.info["levels"]["medium"]
             return described | {"training_steps": medium, "sha256": self.ladder.info["medium_replay"]["sha256"]}
@@ -344,7 +334,7 @@ def _metadata(
     parts: tuple[Part, ...],
     sources: list[Rung | None],
     counts: list[int],
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return Minari's metadata, all of it, and ours under one key."""
     recipe, references, made = recording.recipe, recording.references, versions()
     described = [recording.describe(*item) for item in zip(parts, sources, counts, strict=True)]

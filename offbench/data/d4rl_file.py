@@ -6,7 +6,6 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 from gymnasium.envs.registration import EnvSpec
@@ -14,6 +13,7 @@ from minari.serialization import deserialize_space
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
+from offbench.common.files import JsonObject
 from offbench.data import minari_store
 from offbench.envs.margin_rule import without_margin
 
@@ -29,7 +29,7 @@ class Source:
 
     path: Path
     columns: dict[str, h5py.Dataset]
-    about: dict[str, Any]  # what `offbench export` added: Minari's metadata
+    about: JsonObject  # what `offbench export` added: Minari's metadata
 
     def __len__(self) -> int:
         return len(self.columns["rewards"])
@@ -66,7 +66,7 @@ def _own(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
 
     Every link is looked at before it is followed: it may lead to any file of this machine.
     """
-    node: Any = file
+    node = file
     for part in name.split("/"):
         link = node.get(part, getlink=True)
         if link is None:
@@ -95,7 +95,7 @@ def _check(path: Path, columns: dict[str, h5py.Dataset]) -> None:
         raise OffbenchError(f"{path}: next_observations {columns['next_observations'].shape} differ from observations")
 
 
-def _about(path: Path, file: h5py.File) -> dict[str, Any]:
+def _about(path: Path, file: h5py.File) -> JsonObject:
     """Return the metadata that `offbench export` wrote into the file, checked; {} for other files."""
     text = file.attrs.get("offbench")
     if text is None:

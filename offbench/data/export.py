@@ -15,7 +15,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -23,13 +23,16 @@ from minari.serialization import serialize_space
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import disk_errors, output_file
+from offbench.common.files import JsonObject, disk_errors, output_file
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.progress import Progress
 from offbench.data import minari_store
 from offbench.data.file_stamps import unchanged
 from offbench.data.minari_reader import episodes_of, finite, flags, float32, open_minari, reading
 from offbench.envs.environments import box
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
 
 FORMATS = {"d4rl": (".hdf5", ".h5"), "npz": (".npz",)}  # and how their files end
 TRAVELS = (  # Minari's metadata that go along
@@ -100,7 +103,7 @@ def _style(out: Path, style: str | None) -> str:
     return by_name
 
 
-def _columns(data: Any, dataset_id: str, progress: Progress) -> Iterator[Columns]:
+def _columns(data: MinariDataset, dataset_id: str, progress: Progress) -> Iterator[Columns]:
     """Yield the columns of one episode after another, checked to fit together."""
     seeds = _seed_columns(data, dataset_id)
     for e in episodes_of(data):
@@ -123,7 +126,7 @@ def _columns(data: Any, dataset_id: str, progress: Progress) -> Iterator[Columns
         progress.to(progress.done + steps)
 
 
-def _seed_columns(data: Any, dataset_id: str) -> Callable[[int | None, int], Columns]:
+def _seed_columns(data: MinariDataset, dataset_id: str) -> Callable[[int | None, int], Columns]:
     """Return what makes an episode's columns of its seed.
 
     Seeds are int64, and -1 where there is none; if one is 2**63 or more (Minari's DataCollector draws 64 bits) they
@@ -139,7 +142,7 @@ def _seed_columns(data: Any, dataset_id: str) -> Callable[[int | None, int], Col
     }
 
 
-def _about(data: Any, metadata: dict[str, Any]) -> str:
+def _about(data: MinariDataset, metadata: JsonObject) -> str:
     """Return the metadata that travel, as JSON."""
     about = {key: metadata[key] for key in TRAVELS if metadata.get(key) is not None}
     about |= {key: serialize_space(getattr(data, key)) for key in ("observation_space", "action_space")}
@@ -196,7 +199,7 @@ def _write_npz(path: Path, parts: Iterator[Columns], drop_timeouts: bool, droppe
     Args:
         dropped: an import has left out the steps at timeouts already; what is flagged now is the step before.
     """
-    kinds: dict[str, tuple[Any, tuple[int, ...]]] = {}
+    kinds: dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]] = {}
     count = 0
     with contextlib.ExitStack() as stack:
         raw: dict[str, SafeFile] = {}

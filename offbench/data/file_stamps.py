@@ -5,10 +5,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from offbench.common.errors import OffbenchError
-from offbench.common.files import sha256_of
+from offbench.common.files import JsonObject, sha256_of
 from offbench.data import minari_store
 
 Stamps = dict[str, list[int]]
@@ -58,7 +57,7 @@ def recorded(path: Path) -> tuple[str, list[int]]:
     return sha256_of(path), before
 
 
-def checked(paths: Mapping[str, Path], written: Mapping[str, Any]) -> dict[str, Any]:
+def checked(paths: Mapping[str, Path], written: JsonObject) -> JsonObject:
     """Return the hashes and stamps of files that are as recorded, with today's stamps.
 
     A file with the recorded stamp has not been touched. Any other one, such as a copy, is hashed.

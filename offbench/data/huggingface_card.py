@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from offbench.common.files import output_file, write_bytes
 from offbench.common.scores import normalize
@@ -96,5 +95,5 @@ def _content(summary: Summary) -> dict[str, str]:
     return facts
 
 
-def _table(facts: dict[str, Any]) -> list[str]:
+def _table(facts: dict[str, str]) -> list[str]:
     return markdown(["", ""], [[plain(name), plain(value)] for name, value in facts.items()])

@@ -19,7 +19,6 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import h5py
@@ -28,13 +27,13 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import damage, sha256_of
+from offbench.common.files import JsonObject, damage, sha256_of
 from offbench.common.progress import Progress
 from offbench.common.provenance import versions
 from offbench.data import minari_store
 from offbench.data.d4rl_file import NUMBERS, SEEDS, Source, read_source
 from offbench.data.minari_reader import flags
-from offbench.envs.environments import box, make_env, time_limit
+from offbench.envs.environments import Space, box, make_env, spaces_of, time_limit
 from offbench.envs.margin_rule import ADDED, MARGIN, without_margin
 from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference, load_recipe, names
 from offbench.rollouts.rollouts import Episode
@@ -161,9 +160,8 @@ def _by_name(source: Source, recipe: Recipe) -> _Origin:
 
 def _shapes(spec: str) -> tuple[int, int]:
     """Return the dimensions of observations and actions of an environment with flat spaces."""
-    env: Any = make_env(spec)
-    env.close()
-    return env.observation_space.shape[0], env.action_space.shape[0]
+    observations, actions = spaces_of(make_env(spec), "the environment")
+    return observations.shape[0], actions.shape[0]
 
 
 def _words(shapes: tuple[int, int]) -> str:
@@ -303,15 +301,13 @@ def _episode(part: dict[str, Array], terminated: bool, truncated: bool, complete
     return Episode(seed, observations, actions, rewards, terminated, truncated)
 
 
-def _metadata(
-    source: Source, origin: _Origin, dataset_id: str
-) -> tuple[dict[str, Any], tuple[gym.Space[Any], gym.Space[Any]]]:
+def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObject, tuple[Space, Space]]:
     """Return Minari's metadata and the spaces."""
     about, complete = source.about, "next_observations" in source.columns
     fields = {key: about[key] for key in (*NUMBERS, "requirements") if key in about}
     fields |= {key: set(about[key]) for key in ("author", "author_email") if key in about}
     constants = d4rl_reference(origin.recorded)
-    ours: dict[str, Any] = {
+    ours: JsonObject = {
         "format": "offbench-import-1",
         "timeouts": "kept" if complete else "dropped",
         "final_observations": "kept" if complete else "repeated",
@@ -324,7 +320,7 @@ def _metadata(
         "offbench": versions()["offbench"],
     }
     where = f", recorded in {json.loads(origin.recorded)['id']}" if origin.recorded else ""
-    metadata: dict[str, Any] = fields | {
+    metadata: JsonObject = fields | {
         "dataset_id": dataset_id,
         "minari_version": versions()["minari"],
         "algorithm_name": about.get("algorithm_name", "unknown"),
@@ -338,7 +334,7 @@ def _metadata(
     return metadata, _spaces(source, origin.recipe)
 
 
-def _spaces(source: Source, recipe: Recipe | None) -> tuple[gym.Space[Any], gym.Space[Any]]:
+def _spaces(source: Source, recipe: Recipe | None) -> tuple[Space, Space]:
     """Return the spaces: those an export kept, else the data's types with the recipe's action bounds."""
     about, observations, actions = source.about, source.columns["observations"], source.columns["actions"]
     kept = about.get("spaces", ())
@@ -350,12 +346,10 @@ def _spaces(source: Source, recipe: Recipe | None) -> tuple[gym.Space[Any], gym.
     low = high = np.ones(actions.shape[1:], np.float32)
     low = -low
     if recipe is not None:
-        env = make_env(recipe.env_spec())
-        space: Any = env.action_space
-        env.close()
+        _, space = spaces_of(make_env(recipe.env_spec()), recipe.env_id)
         if space.shape == actions.shape[1:]:
             low, high = space.low, space.high
-    kind: Any = actions.dtype.type
+    kind = actions.dtype.type
     return (
         gym.spaces.Box(-np.inf, np.inf, observations.shape[1:], observations.dtype.type),
         gym.spaces.Box(low.astype(kind), high.astype(kind), dtype=kind),

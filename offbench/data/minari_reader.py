@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -17,6 +17,9 @@ from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import damage, regular
 from offbench.data import minari_store
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
 
 AGAIN = "record or download it again"
 LARGEST = float(np.finfo(np.float32).max)
@@ -58,7 +61,7 @@ class Recorded:
         return self.observations, self.actions, self.rewards, self.terminations, self.truncations
 
 
-def episodes_of(data: Any, indices: Iterable[int] | None = None) -> Iterator[Recorded]:
+def episodes_of(data: MinariDataset, indices: Iterable[int] | None = None) -> Iterator[Recorded]:
     """Yield a MinariDataset's episodes (all, or those of `indices`) with their seeds.
 
     Raises:
@@ -75,7 +78,7 @@ def episodes_of(data: Any, indices: Iterable[int] | None = None) -> Iterator[Rec
             yield Recorded(int(episode.id), None if seed is None else int(seed), *arrays)
 
 
-def open_minari(dataset_id: str) -> Any:
+def open_minari(dataset_id: str) -> MinariDataset:
     """Return the MinariDataset of a local id, to read its episodes.
 
     Raises:
@@ -123,7 +126,7 @@ def _elsewhere(file: h5py.File) -> str | None:
     return None
 
 
-def open_parsed(dataset_id: str) -> Any:
+def open_parsed(dataset_id: str) -> MinariDataset:
     """Return the MinariDataset of a local id whose storage has not been checked yet; see `open_minari`."""
     metadata = minari_store.read_metadata(dataset_id)
     if "observation_space" not in metadata or "action_space" not in metadata:

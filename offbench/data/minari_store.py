@@ -10,18 +10,18 @@ import shutil
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 from filelock import FileLock, Timeout
 from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
-from offbench.common.files import disk_errors, exclusive_lock, read_json
+from offbench.common.files import JsonObject, disk_errors, exclusive_lock, read_json
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.data.levels import parse_level
+from offbench.envs.environments import Space
 from offbench.envs.margin_rule import ADDED, EARLIER, MARGIN, without_margin
 from offbench.envs.recipes import load_recipe, names
 from offbench.rollouts.rollouts import Episode
@@ -115,7 +115,7 @@ def _not_downloaded(dataset_id: str) -> OffbenchError:
     )
 
 
-def read_metadata(dataset_id: str) -> dict[str, Any]:
+def read_metadata(dataset_id: str) -> JsonObject:
     """Return a local dataset's metadata as Minari wrote it.
 
     Raises:
@@ -130,17 +130,15 @@ def read_metadata(dataset_id: str) -> dict[str, Any]:
         _check_metadata(metadata)
     except (ValueError, TypeError, RecursionError) as error:
         raise DamagedError(f"{path} is damaged: {error}; {remedy}") from None
-    return dict(metadata)
+    return metadata
 
 
 TEXTS = ("env_spec", "eval_env_spec", "observation_space", "action_space", "algorithm_name", "description")
 NUMBERS = ("ref_min_score", "ref_max_score", "total_steps", "total_episodes")
 
 
-def _check_metadata(metadata: Any) -> None:
+def _check_metadata(metadata: JsonObject) -> None:
     """Raise ValueError if a field that is read here is of another kind than it should be; all may be missing."""
-    if not isinstance(metadata, dict):
-        raise ValueError("not a table")
     for key in (*TEXTS, *NUMBERS):
         value = metadata.get(key)
         number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e15
@@ -171,7 +169,7 @@ def exists(dataset_id: str) -> bool:
     return inside and (root() / dataset_id / "data" / "metadata.json").exists()
 
 
-def provenance(metadata: dict[str, Any]) -> dict[str, Any]:
+def provenance(metadata: JsonObject) -> JsonObject:
     """Return what offbench recorded about a dataset ({} for others' datasets)."""
     ours = metadata.get(KEY)
     return ours if isinstance(ours, dict) else {}
@@ -255,9 +253,9 @@ def write(
     path: Path,
     episodes: Iterable[Episode],
     spec: str | None,
-    metadata: dict[str, Any],
+    metadata: JsonObject,
     steps: int,
-    spaces: tuple[gym.Space[Any], gym.Space[Any]] | None = None,
+    spaces: tuple[Space, Space] | None = None,
     expected: str | None = None,
 ) -> str:
     """Write episodes as a Minari HDF5 dataset at `path`, whole or not at all; return the content hash.
@@ -328,7 +326,9 @@ def _recover(path: Path) -> None:
         shutil.rmtree(left, ignore_errors=True)
 
 
-def _buffers(episodes: Iterable[Episode], dtype: Any, content: ContentHash, file: SafeFile) -> Iterator[EpisodeBuffer]:
+def _buffers(
+    episodes: Iterable[Episode], dtype: npt.DTypeLike, content: ContentHash, file: SafeFile
+) -> Iterator[EpisodeBuffer]:
     for episode in episodes:
         file.check()
         observations = episode.observations.astype(dtype, copy=False)
@@ -348,7 +348,7 @@ def _buffers(episodes: Iterable[Episode], dtype: Any, content: ContentHash, file
         )
 
 
-def _check_room(folder: Path, storage: Any, steps: int) -> None:
+def _check_room(folder: Path, storage: MinariStorage, steps: int) -> None:
     """Refuse to begin what the disk cannot hold (episodes of 100 steps assumed)."""
     width = storage.observation_space.shape[0] * storage.observation_space.dtype.itemsize
     width += storage.action_space.shape[0] * 4 + 10

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from typing import Any
 
 from offbench.agents.ladder import Ladder
 from offbench.common.errors import OffbenchError
+from offbench.common.files import JsonObject
 from offbench.data import minari_store
 from offbench.envs.recipes import Recipe
 
@@ -19,7 +19,7 @@ def warn_other_references(recipe: Recipe, ladder: Ladder) -> None:
     for dataset_id in minari_store.local_ids():
         with contextlib.suppress(OffbenchError):
             ours = minari_store.provenance(minari_store.read_metadata(dataset_id))
-            if ours.get("env") == recipe.name and _scale(ours.get("references")) not in (None, wanted):
+            if ours.get("env") == recipe.name and _scale(ours.get("references", {})) not in (None, wanted):
                 others.append(dataset_id)
     if others:
         print(
@@ -30,7 +30,7 @@ def warn_other_references(recipe: Recipe, ladder: Ladder) -> None:
         )
 
 
-def _scale(references: Any) -> list[float] | None:
+def _scale(references: JsonObject) -> list[float] | None:
     try:
         return [references[name]["return"] for name in ("random", "expert")]
     except (KeyError, TypeError):

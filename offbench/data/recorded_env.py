@@ -5,22 +5,20 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
-from typing import Any
-
-import gymnasium as gym
 
 from offbench.common.errors import OffbenchError
+from offbench.common.files import JsonObject
 from offbench.common.provenance import versions
 from offbench.data import minari_store
 from offbench.envs import environments
-from offbench.envs.environments import believed_env
+from offbench.envs.environments import Env, believed_env
 from offbench.envs.margin_rule import ADDED, EARLIER, MARGIN, SINCE, with_margin
 from offbench.envs.recipes import load_recipe, names
 
 CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d+)(?:\.(\d+))?")  # of a requirement: `>=3.1.0,<3.2.0` has two
 
 
-def make_env(name: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
+def make_env(name: str, render_mode: str | None = None) -> Env:
     """Make a dataset's environment, or a recipe's, with the same physics on every MuJoCo version.
 
     Args:
@@ -41,13 +39,13 @@ def make_env(name: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
     return environments.make_env(spec, render_mode)
 
 
-def evaluation_spec(metadata: dict[str, Any]) -> str | None:
+def evaluation_spec(metadata: JsonObject) -> str | None:
     """Return the environment to evaluate a dataset's policies in, as EnvSpec JSON; None if it names none."""
     spec = metadata.get("eval_env_spec") or metadata.get("env_spec")
     return with_margin(spec, recorded_margin(metadata) or EARLIER) if spec else None
 
 
-def recorded_margin(metadata: dict[str, Any]) -> str | None:
+def recorded_margin(metadata: JsonObject) -> str | None:
     """Return the rule for contact margins that a dataset was recorded under; None if its metadata do not tell."""
     ours = minari_store.provenance(metadata)
     if MARGIN in ours or "versions" in ours:  # recorded by offbench, which kept the earlier rule before it noted it
@@ -61,7 +59,7 @@ def recorded_margin(metadata: dict[str, Any]) -> str | None:
     return None
 
 
-def _demands(metadata: dict[str, Any]) -> list[tuple[str, str, str]]:
+def _demands(metadata: JsonObject) -> list[tuple[str, str, str]]:
     """Return (operator, major, minor) of each demand that Minari's requirements make on MuJoCo's version."""
     listed = metadata.get("requirements")
     ours = (
@@ -70,7 +68,7 @@ def _demands(metadata: dict[str, Any]) -> list[tuple[str, str, str]]:
     return [clause for item in ours for clause in CLAUSE.findall(item)]
 
 
-def recorded_mujoco(metadata: dict[str, Any]) -> str | None:
+def recorded_mujoco(metadata: JsonObject) -> str | None:
     """Return the MuJoCo version a dataset was recorded with: ours, or what a requirement pins; None if unknown."""
     made = minari_store.provenance(metadata).get("versions")
     if isinstance(made, dict) and "mujoco" in made:
@@ -93,7 +91,7 @@ def margins_matter(spec: str) -> bool:
     return model is not None and has_margins(model)
 
 
-def say_margin(dataset_id: str, metadata: dict[str, Any], spec: str) -> None:
+def say_margin(dataset_id: str, metadata: JsonObject, spec: str) -> None:
     """Say which rule a dataset's environment (EnvSpec JSON) is made with, where that is not plain."""
     rule = recorded_margin(metadata)
     if rule == EARLIER or not margins_matter(spec):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
+from offbench.common.files import JsonObject
 from offbench.common.scores import normalize
 from offbench.data import minari_store
 
@@ -22,7 +22,7 @@ class Summary:
     """What is in a dataset: `lines()` for a terminal, `plot(path)` for a picture."""
 
     dataset_id: str
-    metadata: dict[str, Any]
+    metadata: JsonObject
     returns: Array
     lengths: Array
     terminated: float
@@ -84,7 +84,7 @@ def show(dataset_id: str) -> Summary:
     return Summary(dataset_id, data.metadata, np.asarray(data.returns), lengths, terminated)
 
 
-def fact(value: Any) -> str:
+def fact(value: object) -> str:
     """Return a value of the metadata as a person writes it."""
     if isinstance(value, bool) or not isinstance(value, int | float | list):
         return str(value)
@@ -93,7 +93,7 @@ def fact(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int) else f"{value:,.4g}" if abs(value) < 100 else f"{value:,.1f}"
 
 
-def space(metadata: dict[str, Any], key: str) -> str:
+def space(metadata: JsonObject, key: str) -> str:
     """Return a space of the metadata, e.g. `Box (11,) float64`."""
     import json
 

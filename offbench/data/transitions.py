@@ -19,7 +19,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -27,13 +27,16 @@ from filelock import FileLock, Timeout
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import disk_errors, read_text, write_json
+from offbench.common.files import JsonObject, disk_errors, read_text, write_json
 from offbench.common.progress import Progress
 from offbench.data import minari_store
 from offbench.data.file_stamps import ReplacedError, Stamps, checked, recorded, unchanged
 from offbench.data.minari_reader import check_storage, flags, float32, open_parsed, reading
 from offbench.data.recorded_env import evaluation_spec
 from offbench.envs.environments import action_box, box, same_environment
+
+if TYPE_CHECKING:
+    from minari import EpisodeData, MinariDataset
 
 ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
 ATTEMPTS = 3  # to read a dataset that is replaced meanwhile
@@ -57,7 +60,7 @@ class Transitions:
     returns: Array
     low: Array
     high: Array
-    metadata: dict[str, Any]
+    metadata: JsonObject
     evaluated_in: str | None = None  # EnvSpec JSON: the user's choice instead of the dataset's environment
 
     def __len__(self) -> int:
@@ -181,7 +184,7 @@ def cache() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "offbench"
 
 
-def _key(dataset_id: str, metadata: dict[str, Any], stamps: Stamps) -> str:
+def _key(dataset_id: str, metadata: JsonObject, stamps: Stamps) -> str:
     """Return the cache's name for a dataset: it changes with the content and with the files."""
     folder = minari_store.path_of(dataset_id) / "data"
     sizes_and_times = [(name, size, mtime) for name, (size, mtime, *_) in stamps.items()]
@@ -191,7 +194,7 @@ def _key(dataset_id: str, metadata: dict[str, Any], stamps: Stamps) -> str:
 
 
 def _convert(
-    data: Any,
+    data: MinariDataset,
     dataset_id: str,
     observations: gym.spaces.Box,
     actions: gym.spaces.Box,
@@ -265,13 +268,13 @@ def _remove_leftovers(folder: Path) -> None:
                 shutil.rmtree(aside, ignore_errors=True)
 
 
-def _episodes(data: Any, dataset_id: str) -> Iterator[Any]:
+def _episodes(data: MinariDataset, dataset_id: str) -> Iterator[EpisodeData]:
     with reading(dataset_id):
         yield from data.iterate_episodes()
 
 
 def _episode_arrays(
-    episode: Any, observations: gym.spaces.Box, actions: gym.spaces.Box, where: str
+    episode: EpisodeData, observations: gym.spaces.Box, actions: gym.spaces.Box, where: str
 ) -> dict[str, Array]:
     """Return one episode's arrays as float32, checked: shapes, T + 1 observations, finite numbers."""
     steps = len(episode.rewards) if np.ndim(episode.rewards) else 0

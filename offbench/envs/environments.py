@@ -52,7 +52,7 @@ def env_spec(env_id: str, **kwargs: Any) -> str:
             hint = f". If a module of yours registers it, name it before a colon: my_module:{env_id}"
         raise OffbenchError(f"cannot make the environment {env_id!r}: {reason(error).rstrip('.')}{hint}") from error
     _check_importable(env.spec)
-    _check_spaces(env, env_id)
+    spaces_of(env, env_id)
     _warn_endless(env_id, env.spec)
     return text
 
@@ -71,17 +71,16 @@ def checked_spec(text: str, where: str, observation_dim: int, low: Array, high: 
         _warn_endless(spec.id, spec)
     try:
         env = believed_env(text, where)
-        _check_spaces(env, where)
+        observations, actions = spaces_of(env, where)
     except OffbenchError as error:
         raise OffbenchError(f"{error}; to evaluate in another environment, {ELSEWHERE}") from error
     name = env.spec.id if env.spec else "?"
-    shapes = (env.observation_space.shape, env.action_space.shape)
+    shapes = (observations.shape, actions.shape)
     if shapes != ((observation_dim,), low.shape):
         raise OffbenchError(
             f"{where} has observations ({observation_dim},) and actions {low.shape}; the environment {name} has "
             f"{shapes[0]} and {shapes[1]}: {ELSEWHERE}"
         )
-    actions = box(env.action_space, f"{where}: actions")
     if not same_bounds(actions, low, high):
         print(
             f"offbench: warning: {where} has actions with bounds {_bounds(low, high)}, the environment {name} takes "
@@ -254,10 +253,14 @@ def _remedy(error: BaseException) -> str:
     return ""
 
 
-def _check_spaces(env: Env, where: str) -> None:
+def spaces_of(env: Env, where: str) -> tuple[gym.spaces.Box, gym.spaces.Box]:
+    """Close an environment; return its spaces of observations and actions.
+
+    Raises:
+        OffbenchError: they are no flat float Boxes, or actions have no bounds; it begins with `where`.
+    """
     try:
-        box(env.observation_space, f"{where}: observations")
-        action_box(env.action_space, f"{where}: actions")
+        return box(env.observation_space, f"{where}: observations"), action_box(env.action_space, f"{where}: actions")
     finally:
         env.close()
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from offbench.common import seeds
+from offbench.common.files import JsonObject
 from offbench.common.scores import normalize
 from offbench.common.seeds import Purpose
 from offbench.data.levels import LEVELS
@@ -19,9 +19,7 @@ SIGMAS = 6  # a level's mean return may be off by so many standard errors,
 SLACK = 0.02  # and by this share of the references' distance: rungs are chosen for their measured return
 
 
-def check_claims(
-    ours: dict[str, Any], survey: Survey, limit: int | None, report: Report, findings: Findings
-) -> list[int]:
+def check_claims(ours: JsonObject, survey: Survey, limit: int | None, report: Report, findings: Findings) -> list[int]:
     """Check what offbench recorded about a dataset; return the last episode of each part."""
     last = [len(survey.lengths) - 1] if survey.lengths else []
     if "content_sha256" in ours:
@@ -46,7 +44,7 @@ def check_claims(
     return last
 
 
-def _cuts(parts: Sequence[dict[str, Any]], survey: Survey, findings: Findings) -> list[tuple[int, int]] | None:
+def _cuts(parts: Sequence[JsonObject], survey: Survey, findings: Findings) -> list[tuple[int, int]] | None:
     """Return the episodes [first, end) of each part, or None if parts do not end where episodes do."""
     ends = np.cumsum(survey.lengths)
     wanted = np.cumsum([int(part["transitions"]) for part in parts])
@@ -57,13 +55,13 @@ def _cuts(parts: Sequence[dict[str, Any]], survey: Survey, findings: Findings) -
     return list(zip([0, *(places[:-1] + 1)], places + 1, strict=True))
 
 
-def _references(ours: dict[str, Any]) -> tuple[float, float]:
+def _references(ours: JsonObject) -> tuple[float, float]:
     """Return the random and the expert return; infinity for an expert that was not trained yet."""
     references = {"expert": {"return": math.inf}} | ours["references"]
     return float(references["random"]["return"]), float(references["expert"]["return"])
 
 
-def _levels(ours: dict[str, Any], findings: Findings) -> None:
+def _levels(ours: JsonObject, findings: Findings) -> None:
     """Check that the levels' own numbers agree with each other."""
     low, high = _references(ours)
     returns = {part["source"]: float(part["return"]) for part in ours["parts"] if "return" in part}
@@ -80,8 +78,8 @@ def _levels(ours: dict[str, Any], findings: Findings) -> None:
 
 
 def _part(
-    ours: dict[str, Any],
-    part: dict[str, Any],
+    ours: JsonObject,
+    part: JsonObject,
     index: int,
     chosen: range,
     survey: Survey,

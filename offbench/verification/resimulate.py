@@ -17,6 +17,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.data.minari_reader import Recorded
+from offbench.envs.environments import Env, box
 from offbench.rollouts.rollouts import kept_envs, reset, step
 
 STEPS = 40  # of an episode that are replayed one by one
@@ -55,7 +56,7 @@ def check(spec: str, episode: Recorded, exact: bool, last_unknown: bool) -> Verd
     return Verdict(episode.index, "none", 0)
 
 
-def _from_seed(env: gym.Env[Any, Any], e: Recorded, tolerance: float) -> Verdict:
+def _from_seed(env: Env, e: Recorded, tolerance: float) -> Verdict:
     observations, rewards, ends = [reset(env, e.seed)], [], [False, False]
     for action in e.actions:
         observation, reward, *ends = step(env, action)
@@ -97,7 +98,7 @@ def _off(a: Array, b: Array, tolerance: float) -> Array:
     return np.asarray(far.reshape(len(far), -1).any(1))
 
 
-def _why(env: gym.Env[Any, Any], played: Array, e: Recorded, first: int, tolerance: float) -> tuple[str, str]:
+def _why(env: Env, played: Array, e: Recorded, first: int, tolerance: float) -> tuple[str, str]:
     """Name the fault of an episode whose observations part from the environment's at row `first`."""
     rows = len(played)
     close = max(tolerance, CLOSE)
@@ -107,12 +108,12 @@ def _why(env: gym.Env[Any, Any], played: Array, e: Recorded, first: int, toleran
         return "shifted-observations", "row t holds what was there before action t - 1"
     if first == 0:
         return "other-start", f"by up to {np.abs(played[0] - e.observations[0]).max():.3g}"
-    if _piled(e.actions, env.action_space)[first - 1]:
+    if _piled(e.actions, box(env.action_space, "actions"))[first - 1]:
         return "clipped-actions", f"the first step that does not follow its action is {first - 1}"
     return "other-physics", f"from row {first}, by {np.abs(played[first] - e.observations[first]).max():.3g} there"
 
 
-def _piled(actions: Array, space: Any) -> Array:
+def _piled(actions: Array, space: gym.spaces.Box) -> Array:
     """Return which steps [T] have an action at the outermost value of a component, if several steps share it.
 
     At the space's own bounds that is no clipping after the fact: what lies beyond them is never executed.
@@ -140,7 +141,7 @@ class _State:
         self.env.set_state(positions, whole[self.positions :].copy())
 
     @classmethod
-    def of(cls, env: gym.Env[Any, Any]) -> _State | None:
+    def of(cls, env: Env) -> _State | None:
         """Return the way to set the state, or None where the observation does not tell all of it."""
         inner: Any = env.unwrapped
         if not (hasattr(inner, "set_state") and hasattr(getattr(inner, "model", None), "nq")):
@@ -154,7 +155,7 @@ class _State:
                 return state
         return None
 
-    def _works(self, env: gym.Env[Any, Any]) -> bool:
+    def _works(self, env: Env) -> bool:
         """Try it: a step from a set state must lead where the same step leads without setting it."""
         observation, reward = reset(env, 0), 0.0
         rng = np.random.default_rng(0)
@@ -169,7 +170,7 @@ class _State:
         return not _off(again[None, : self.size], observation[None, : self.size], WHOLE).any()
 
 
-def _one_step(env: gym.Env[Any, Any], state: _State, e: Recorded, exact: bool, last_unknown: bool) -> Verdict:
+def _one_step(env: Env, state: _State, e: Recorded, exact: bool, last_unknown: bool) -> Verdict:
     seen = np.asarray(e.observations, np.float64)
     rounded = bool((seen == seen.astype(np.float32)).all())
     tolerance = ROUNDED if rounded else WHOLE if exact else CLOSE
@@ -206,9 +207,7 @@ def _far(observation: Array, recorded: Array, state: _State, tolerance: float) -
     return bool(_off(actual, recorded[None, : state.size], tolerance)[0])
 
 
-def _why_step(
-    env: gym.Env[Any, Any], state: _State, e: Recorded, steps: Array, moved: Array, tolerance: float
-) -> tuple[str, str]:
+def _why_step(env: Env, state: _State, e: Recorded, steps: Array, moved: Array, tolerance: float) -> tuple[str, str]:
     """Name the fault of an episode whose steps lead elsewhere."""
     for offset, words in ((1, "row t holds what followed action t"), (-1, "row t holds what preceded action t - 1")):
         near = [t for t in steps[1:-1] if 0 <= t + offset < len(e)]
@@ -219,6 +218,6 @@ def _why_step(
             off.append(_far(observation, e.observations[t + 1].astype(np.float64), state, tolerance))
         if near and sum(off) < 0.2 * len(near) < sum(moved):
             return "shifted-observations", words
-    if _piled(e.actions, env.action_space)[steps[moved]].all():
+    if _piled(e.actions, box(env.action_space, "actions"))[steps[moved]].all():
         return "clipped-actions", f"{moved.sum()} of {len(steps)} steps do not follow their actions"
     return "other-physics", f"{moved.sum()} of {len(steps)} steps lead elsewhere"

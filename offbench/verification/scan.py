@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +14,9 @@ from offbench.common.progress import Progress
 from offbench.data.minari_reader import Recorded, episodes_of
 from offbench.data.minari_store import ContentHash
 from offbench.verification.findings import Findings
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
 
 PILE = 10  # equal actions at the outermost value that are no coincidence,
 PILE_SHARE = 0.001  # if they are at least this share of all
@@ -37,7 +40,7 @@ class Survey:
         return sum(self.lengths)
 
 
-def scan(data: Any, limit: int | None, findings: Findings) -> Survey:
+def scan(data: MinariDataset, limit: int | None, findings: Findings) -> Survey:
     """Look at every episode of a MinariDataset once; `limit` is the environment's time limit, if it has one."""
     result, piles, twins = Survey(), _Piles(data.action_space), _Twins()
     with Progress(int(data.total_steps), f"verifying {data.storage.metadata.get('dataset_id')}") as progress:

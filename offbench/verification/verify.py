@@ -10,10 +10,13 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
+
+from gymnasium.spaces import Box
 
 from offbench.common import seeds
 from offbench.common.errors import DamagedError, OffbenchError
+from offbench.common.files import JsonObject
 from offbench.common.processes import default_workers
 from offbench.common.provenance import versions
 from offbench.common.seeds import Purpose
@@ -29,6 +32,9 @@ from offbench.verification.findings import Findings, Report
 from offbench.verification.metadata import check_claims
 from offbench.verification.resimulate import Verdict, check
 from offbench.verification.scan import Survey, scan
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
 
 EPISODES = 300  # played again by default: half a minute for a million transitions
 SOME = 10  # of them tell the rule for contact margins, about
@@ -101,7 +107,7 @@ def _limit(spec: str | None) -> int | None:
     return limit if isinstance(limit, int) and limit > 0 else None
 
 
-def _counts(metadata: dict[str, Any], dataset_id: str, survey: Survey, findings: Findings) -> None:
+def _counts(metadata: JsonObject, dataset_id: str, survey: Survey, findings: Findings) -> None:
     for key, count in (("total_steps", survey.steps), ("total_episodes", len(survey.lengths))):
         if metadata.get(key) != count:
             findings.add("counts", "metadata", f"{key} is {metadata.get(key)}, the data have {count}")
@@ -118,10 +124,10 @@ def _terminations(survey: Survey, limit: int | None, findings: Findings) -> None
 
 
 def _play(
-    data: Any,
+    data: MinariDataset,
     chosen: Sequence[int],
     survey: Survey,
-    metadata: dict[str, Any],
+    metadata: JsonObject,
     workers: int,
     report: Report,
     findings: Findings,
@@ -163,16 +169,16 @@ def _play(
     _tell(verdicts, made if exact else None, report, findings)
 
 
-def _same_spaces(spec: str, data: Any, report: Report, findings: Findings) -> bool:
+def _same_spaces(spec: str, data: MinariDataset, report: Report, findings: Findings) -> bool:
     """Return whether the environment can be made and has the dataset's spaces; say what hinders it."""
     try:
         env = believed_env(spec, "playing episodes again")
     except OffbenchError as error:
         report.skipped.append(str(error))
         return False
-    theirs: Any = env.action_space
+    theirs = env.action_space
     same = env.observation_space.shape == data.observation_space.shape and theirs.shape == data.action_space.shape
-    same = same and same_bounds(theirs, data.action_space.low, data.action_space.high)
+    same = same and isinstance(theirs, Box) and same_bounds(theirs, data.action_space.low, data.action_space.high)
     env.close()
     if not same:
         findings.add("other-spaces", "metadata", f"{env.observation_space} and {theirs}")
