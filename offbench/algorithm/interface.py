@@ -17,7 +17,7 @@ import dataclasses
 import typing
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from types import SimpleNamespace
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, Protocol, Unpack
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple, Protocol, Unpack
 
 import torch
 from torch import Tensor
@@ -25,6 +25,9 @@ from typing_extensions import TypeVar
 
 from offbench.algorithm.networks import Network, NetworkOptions, Parameters, Schedule
 from offbench.common.errors import OffbenchError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 C = TypeVar("C", default=Any)
 
@@ -112,7 +115,7 @@ class Algorithm(Generic[C]):
         uses_next_actions: whether batches hold `next_actions`.
     """
 
-    Config: ClassVar[type]
+    Config: ClassVar[type[DataclassInstance]]
     capture: ClassVar[bool] = True
     uses_next_actions: ClassVar[bool] = False
 
@@ -279,7 +282,7 @@ def has_word(value: Any, word: str) -> Tensor:
     return mask
 
 
-def stack_configs(configs: Sequence[Any], device: torch.device | str) -> Any:
+def stack_configs(configs: Sequence[DataclassInstance], device: torch.device | str) -> Any:
     """Return one config for a stack: `per_run` settings as tensors [runs], the others as they are.
 
     A `per_run` setting that may be a word (beta = "adaptive") is read by `per_sample`.

@@ -7,11 +7,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from offbench.analysis.results import REFERENCES, Entry, Task, Trained, read_results, window_words
 from offbench.analysis.statistics import Estimate, Paired, improvement, paired
 from offbench.common.errors import OffbenchError
+from offbench.common.files import JsonObject
 from offbench.common.text import counted
 
 LEVEL = 0.05  # a difference is evidence below this p, if its interval leaves out 0 too
@@ -112,7 +112,7 @@ class Comparison:
             "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]) for line in [header, *rows]
         ]
 
-    def row(self) -> dict[str, Any]:
+    def row(self) -> JsonObject:
         """Return the comparison as JSON has it."""
         statistics, chance = self.statistics, self.chance
         return {

@@ -7,7 +7,6 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from offbench.common.errors import OffbenchError, nearest, unknown
 from offbench.training.registry import FORMER_SETTINGS, algorithm_names
@@ -70,7 +69,7 @@ class Method:
         return self.algorithm if self.beta is None else f"{self.algorithm} beta={self.beta}"
 
 
-def method_of(algorithm: str, variant: str, settings: Mapping[str, Any]) -> Method:
+def method_of(algorithm: str, variant: str, settings: Mapping[str, object]) -> Method:
     """Return a method by itself, whatever other methods there are."""
     return Method(algorithm, variant, _beta(settings.get("beta")))
 
@@ -133,7 +132,7 @@ def find_method(methods: Sequence[Method], name: str) -> Method:
     raise OffbenchError(f"no method {name!r} here: {hint}")
 
 
-def _beta(value: Any) -> str | None:
+def _beta(value: object) -> str | None:
     if isinstance(value, int | float) and abs(value) < 1e6:
         return f"{value:.2f}"
     return None if value is None else str(value)  # what a damaged config.json or another's algorithm has there
@@ -144,6 +143,6 @@ def rank(name: str, order: Sequence[str]) -> tuple[int, str]:
     return (order.index(name) if name in order else len(order), name)
 
 
-def method_order(method: Method) -> tuple[Any, ...]:
+def method_order(method: Method) -> tuple[tuple[int, str], str, int, str]:
     """Return what sorts methods as the paper's table has them: fixed betas in order, then the words (adaptive)."""
     return rank(method.algorithm, METHOD_ORDER), method.beta or "", len(method.variant), method.variant

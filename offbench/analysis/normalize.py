@@ -6,9 +6,9 @@ import csv
 import io
 import json
 import shlex
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,13 +17,14 @@ from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import Entry, entries_of, read_results
 from offbench.analysis.statistics import iqm
 from offbench.common.errors import OffbenchError
+from offbench.common.files import JsonObject
 from offbench.common.scores import normalize
 from offbench.common.tables import latex, markdown
 from offbench.common.text import aligned, compact, no_formula
 from offbench.envs.recipes import load_recipe
 from offbench.training.run import DIGITS, Run, find_runs
 
-Row = dict[str, Any]
+Row: TypeAlias = JsonObject
 FORMATS = ("table", "json", "csv", "markdown", "latex")
 
 
@@ -176,7 +177,7 @@ def render(rows: Sequence[Row], style: str = "table") -> str:
     return "\n".join([*lines, *(f"note: {note}" for note in notes(rows))])
 
 
-def score_table(rows: Sequence[Row], terminal: bool) -> dict[str, Any]:
+def score_table(rows: Sequence[Row], terminal: bool) -> JsonObject:
     """Return the rows as the arguments of `offbench.common.terminal.print_table`.
 
     Args:
@@ -204,7 +205,7 @@ def _shown(rows: Sequence[Row]) -> list[str]:
 
 def _best(rows: Sequence[Row]) -> set[int]:
     """Return the places of the rows with the highest score of their dataset, where its scores can be compared."""
-    groups: dict[tuple[Any, Any], list[int]] = {}
+    groups: dict[tuple[str | None, str | None], list[int]] = {}
     for i, row in enumerate(rows):
         groups.setdefault((row.get("dataset"), row.get("content")), []).append(i)
     best = set()
@@ -219,7 +220,7 @@ def _best(rows: Sequence[Row]) -> set[int]:
 
 def notes(rows: Sequence[Row]) -> list[str]:
     """Return what a reader must know of a score table: which scores do not compare, settings that names leave out."""
-    windows: dict[tuple[Any, Any], set[Any]] = {}
+    windows: dict[tuple[str, str | None], set[str | None]] = {}
     for row in rows:
         if "window" in row:
             windows.setdefault((row["dataset"], row.get("content")), set()).add(row["window"])
@@ -233,7 +234,7 @@ def notes(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def _cell(row: Mapping[str, Any], key: str, short: bool = False) -> str:
+def _cell(row: Row, key: str, short: bool = False) -> str:
     value = row[key]
     if value is None:
         return "-"

@@ -16,13 +16,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase as fnmatch
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from offbench.analysis.methods import Method, find_method, method_order, name_methods, rank
+from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError, unknown
-from offbench.common.scores import LAST, mean_std, normalize, run_return, window
+from offbench.common.scores import LAST, Evaluations, mean_std, normalize, run_return, window
 from offbench.common.text import counted, printable
 from offbench.data.levels import LEVELS
 from offbench.training.run import DIGITS, Run, RunConfig, find_runs
@@ -68,7 +68,7 @@ class Trained:
 
     run: Run
     config: RunConfig
-    evaluations: Mapping[int, Sequence[tuple[float, int]]]
+    evaluations: Evaluations
 
     @property
     def seed(self) -> int:
@@ -161,7 +161,7 @@ class Entry:
         windows = {trained.window for trained in self.runs}
         return windows.pop() if len(windows) == 1 else None
 
-    def common_curve(self) -> tuple[list[int], np.ndarray[Any, Any]]:
+    def common_curve(self) -> tuple[list[int], Array]:
         """Return the steps that all runs were evaluated at, and their scores [runs, steps]."""
         curves = [trained.curve(self.task.reference) for trained in self.runs]
         steps = sorted(set.intersection(*(set(curve) for curve in curves)))
@@ -172,7 +172,7 @@ class Entry:
         """Whether a picture of the learning curve shows means of several evaluations."""
         return len(self.common_curve()[0]) > LONG_CURVE
 
-    def drawn_curve(self) -> tuple[list[int], np.ndarray[Any, Any]]:
+    def drawn_curve(self) -> tuple[list[int], Array]:
         """Return the common curve as pictures show it.
 
         Of more than LONG_CURVE evaluations, each point is the score that the runs would have if they ended there: the
@@ -325,6 +325,6 @@ def _check_seeds(runs: Sequence[Trained]) -> None:
             )
 
 
-def _task_order(task: Task) -> tuple[Any, ...]:
+def _task_order(task: Task) -> tuple[tuple[int, str], tuple[int, str], str, str]:
     env, level = task.env_and_level
     return rank(level, tuple(LEVELS)), rank(env, ENV_ORDER), task.dataset, task.content

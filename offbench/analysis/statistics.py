@@ -12,15 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import Purpose, generator
 
-Array = NDArray[Any]
 Scores = Mapping[str, Sequence[float]]
 
 RESAMPLES = 10_000

@@ -6,10 +6,10 @@ import json
 import shlex
 import time
 from collections.abc import Iterator
-from typing import Any
 
 from offbench.benchmarks.grid import Source
 from offbench.common.errors import OffbenchError
+from offbench.common.files import JsonObject
 from offbench.data import minari_store
 from offbench.data.collect import collect
 from offbench.data.levels import full_size, parse_level
@@ -62,7 +62,7 @@ def check_recorded(source: Source) -> None:
         )
 
 
-def _differences(metadata: dict[str, Any], source: Source, recipe: Recipe) -> Iterator[str]:
+def _differences(metadata: JsonObject, source: Source, recipe: Recipe) -> Iterator[str]:
     spec = metadata.get("eval_env_spec") or metadata.get("env_spec")
     if spec and not same_environment(spec, without_margin(recipe.env_spec())[0]):
         env_id = json.loads(spec)["id"]
@@ -81,7 +81,7 @@ def _differences(metadata: dict[str, Any], source: Source, recipe: Recipe) -> It
             yield f"{metadata['total_steps']:,} transitions, not {steps:,}"
 
 
-def _level_name(level: Any) -> Any:
+def _level_name(level: str) -> str:
     """Return a level as dataset ids have it, so that 0.60 equals 0.6; anything else (a blend) unchanged."""
     try:
         return parse_level(level)[0]

@@ -19,10 +19,9 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from offbench.common.errors import OffbenchError, unknown
-from offbench.common.files import damage, read_text
+from offbench.common.files import JsonObject, damage, read_text
 from offbench.common.settings import build
 from offbench.data import minari_store
 from offbench.data.levels import parse_level
@@ -60,7 +59,7 @@ class Entry:
     """
 
     algorithm: str
-    settings: Mapping[str, Any]
+    settings: Mapping[str, object]
     times: Times
     label: str = ""
 
@@ -110,13 +109,13 @@ def load_grid(name: str) -> Grid:
     )
 
 
-def _list(value: Any, key: str, where: str) -> list[Any]:
+def _list(value: object, key: str, where: str) -> list[object]:
     if not isinstance(value, list) or not value:
         raise OffbenchError(f"{where}: {key} must be a list with at least one item")
     return value
 
 
-def _times(values: dict[str, Any], default: Times, where: str) -> Times:
+def _times(values: JsonObject, default: Times, where: str) -> Times:
     """Return `default` with the changes in `values`."""
     merged = dataclasses.asdict(default) | values
     seeds = merged.pop("seeds")
@@ -128,7 +127,7 @@ def _times(values: dict[str, Any], default: Times, where: str) -> Times:
     return build(Times, merged | {"seeds": tuple(seeds)}, where)
 
 
-def _source(value: Any, folder: Path, where: str) -> Source:
+def _source(value: object, folder: Path, where: str) -> Source:
     """Return a dataset from its id alone (a shipped recipe's level) or from a table; `folder` is the grid's."""
     if isinstance(value, dict):
         source = build(Source, value, f"{where}: datasets")
@@ -145,7 +144,7 @@ def _source(value: Any, folder: Path, where: str) -> Source:
     return Source(value, env, level)
 
 
-def _entry(value: Any, times: Times, folder: Path, where: str) -> Entry:
+def _entry(value: object, times: Times, folder: Path, where: str) -> Entry:
     if not isinstance(value, dict) or not isinstance(value.get("name"), str):
         raise OffbenchError(f"{where}: each of [[algorithms]] needs a name")
     own = {field.name for field in dataclasses.fields(Times)}

@@ -19,7 +19,7 @@ from offbench.common.text import counted
 from offbench.data import minari_store
 from offbench.data.levels import full_size, parse_level
 from offbench.data.recorded_env import evaluation_spec
-from offbench.envs.environments import believed_env, make_env
+from offbench.envs.environments import believed_env, make_env, spaces_of
 from offbench.envs.recipes import Recipe, load_recipe
 from offbench.training.devices import Machine, pick_machine
 from offbench.training.run import Run
@@ -192,12 +192,8 @@ def _size(source: Source) -> int:
 
 def _bytes_per_step(spec: str) -> int:
     """Return what a transition takes on disk: in the dataset (float64 observations) and in the cache (float32)."""
-    env = make_env(spec)
-    observations, actions = env.observation_space.shape, env.action_space.shape
-    env.close()
-    assert observations is not None
-    assert actions is not None
-    return 12 * observations[0] + 8 * actions[0] + 34
+    observations, actions = spaces_of(make_env(spec), "the environment")
+    return 12 * observations.shape[0] + 8 * actions.shape[0] + 34
 
 
 def _name(spec: RunSpec) -> str:

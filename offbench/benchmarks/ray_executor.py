@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from offbench.benchmarks.datasets import record_source
 from offbench.benchmarks.grid import Source
@@ -30,6 +30,10 @@ from offbench.common.files import write_bytes
 from offbench.data import minari_store
 from offbench.training.jobs import JobProgress, is_over, raise_first, train_job
 from offbench.training.spec import Job, RunSpec
+
+if TYPE_CHECKING:
+    from ray import ObjectRef
+    from ray.actor import ActorHandle
 
 SLICE = 600.0  # seconds that a task trains before it returns
 RETRIES = 5  # times that Ray runs a lost task again
@@ -55,7 +59,7 @@ class RayExecutor:
             import ray
         except ImportError:
             raise OffbenchError("Ray is not installed; run `pip install offbench[ray]`") from None
-        self.ray: Any = ray
+        self.ray = ray
         self.slice = slice_seconds
         if not ray.is_initialized():
             try:
@@ -87,7 +91,7 @@ class RayExecutor:
         """Train jobs, slice by slice, wherever a processor is free; return what went wrong, a line each."""
         jobs = [replace(job, specs=tuple(replace(s, folder=s.folder.resolve()) for s in job.specs)) for job in jobs]
         common = Path(os.path.commonpath([spec.folder for job in jobs for spec in job.specs]))
-        waiting, active, problems = list(range(len(jobs))), dict[Any, int](), list[str]()
+        waiting, active, problems = list(range(len(jobs))), dict["ObjectRef", int](), list[str]()
         with JobProgress(jobs) as progress, _token(common) as token:
             while waiting or active:
                 for index in waiting:
@@ -104,13 +108,13 @@ class RayExecutor:
                     progress.update(index, step, note)
         return problems
 
-    def _start(self, job: Job, index: int, token: str) -> Any:
+    def _start(self, job: Job, index: int, token: str) -> ObjectRef:
         gpu = {"num_gpus": 1} if job.device != "cpu" else {}
         task = self.ray.remote(**self._options, **gpu)(_train)
         rest = replace(job, specs=unfinished(job))
         return task.remote(rest, self.slice, index, str(minari_store.root().resolve()), token, self.server)
 
-    def _result(self, ref: Any, job: Job) -> tuple[bool, list[str]]:
+    def _result(self, ref: ObjectRef, job: Job) -> tuple[bool, list[str]]:
         try:
             result: tuple[bool, list[str]] = self.ray.get(ref)
             return result
@@ -218,7 +222,9 @@ def _restore(environment: dict[str, str | None]) -> None:
             os.environ[key] = value
 
 
-def _train(job: Job, seconds: float, index: int, datasets: str, token: str, server: Any) -> tuple[bool, list[str]]:
+def _train(
+    job: Job, seconds: float, index: int, datasets: str, token: str, server: ActorHandle
+) -> tuple[bool, list[str]]:
     """A task: train a job for a slice of time, which begins now, however long the task has waited."""
     slice_end = time.time() + seconds
     job = replace(job, deadline=slice_end if job.deadline is None else min(job.deadline, slice_end))
@@ -229,7 +235,9 @@ def _train(job: Job, seconds: float, index: int, datasets: str, token: str, serv
     return _task(lambda: _train_here(job, datasets, token, server, report), job.title)
 
 
-def _train_here(job: Job, datasets: str, token: str, server: Any, report: Callable[[int, str], None]) -> list[str]:
+def _train_here(
+    job: Job, datasets: str, token: str, server: ActorHandle, report: Callable[[int, str], None]
+) -> list[str]:
     import ray
 
     if _shared(token):
@@ -247,12 +255,12 @@ def _train_here(job: Job, datasets: str, token: str, server: Any, report: Callab
         return lines
 
 
-def _record(source: Source, datasets: str, token: str, server: Any) -> tuple[bool, list[str]]:
+def _record(source: Source, datasets: str, token: str, server: ActorHandle) -> tuple[bool, list[str]]:
     """A task: record a dataset."""
     return _task(lambda: _record_here(source, datasets, token, server), source.id)
 
 
-def _record_here(source: Source, datasets: str, token: str, server: Any) -> list[str]:
+def _record_here(source: Source, datasets: str, token: str, server: ActorHandle) -> list[str]:
     import ray
 
     if _shared(token):

@@ -6,20 +6,23 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from offbench.algorithm.interface import Algorithm
 from offbench.algorithm.mlp import products_by
 from offbench.data.transitions import Transitions
-from offbench.envs.environments import make_env
+from offbench.envs.environments import make_env, spaces_of
 from offbench.training.captured_update import RECORDED
 from offbench.training.devices import arithmetic
 from offbench.training.grouping import stack_size
 from offbench.training.registry import load_algorithm
 from offbench.training.spec import RunSpec
 from offbench.training.stack import Stack
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 SECONDS = 0.5  # that a measurement lasts at least
 ROWS = 4096  # random transitions
@@ -80,7 +83,12 @@ def operations(spec: RunSpec, env_spec: str) -> float:
 
 
 def random_stack(
-    kind: type[Algorithm], configs: Sequence[Any], env_spec: str, device: str = "cpu", *, rows: int = ROWS
+    kind: type[Algorithm],
+    configs: Sequence[DataclassInstance],
+    env_spec: str,
+    device: str = "cpu",
+    *,
+    rows: int = ROWS,
 ) -> Stack:
     """Return a stack of runs with seeds 0, 1, ... on the same random data of an environment's shapes."""
     specs = [
@@ -92,24 +100,20 @@ def random_stack(
 
 def random_data(env_spec: str, rows: int = ROWS) -> Transitions:
     """Return random transitions of an environment's shapes."""
-    env = make_env(env_spec)
-    space: Any = env.action_space
-    shape = env.observation_space.shape
-    env.close()
-    assert shape is not None
+    observations, actions = spaces_of(make_env(env_spec), "the environment")
     rng = np.random.default_rng(0)
     return Transitions(
         "random",
         "",
-        rng.standard_normal((rows + 1, *shape)).astype(np.float32),
+        rng.standard_normal((rows + 1, *observations.shape)).astype(np.float32),
         np.arange(rows),
-        rng.uniform(-1, 1, (rows, *space.shape)).astype(np.float32),
+        rng.uniform(-1, 1, (rows, *actions.shape)).astype(np.float32),
         rng.standard_normal(rows).astype(np.float32),
         np.ones(rows, np.float32),
         np.array([rows]),
         np.zeros(1),
-        space.low,
-        space.high,
+        actions.low,
+        actions.high,
         {"env_spec": env_spec},
     )
 

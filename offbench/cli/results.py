@@ -7,6 +7,7 @@ from json import dumps
 from typing import Any
 
 from offbench.cli.arguments import Parser, completed, local_datasets, methods, natural, number, recipes, trust, whole
+from offbench.common.files import JsonObject
 from offbench.common.terminal import is_terminal, note, print_table, say
 
 RUNS_HELP = "folder of the runs (default: runs)"
@@ -46,7 +47,7 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
-def print_scores(rows: list[dict[str, Any]], style: str = "table") -> None:
+def print_scores(rows: list[JsonObject], style: str = "table") -> None:
     """Print the rows of `normalize`."""
     from offbench.analysis.normalize import notes, render, score_table
 

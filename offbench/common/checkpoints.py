@@ -7,7 +7,6 @@ import os
 import re
 import sys
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import safe_open
@@ -15,15 +14,13 @@ from safetensors.torch import save
 
 from offbench.common.arrays import content_sha256
 from offbench.common.errors import DamagedError
-from offbench.common.files import damage, regular, write_bytes
+from offbench.common.files import JsonObject, damage, regular, write_bytes
 
 KEPT = 2
 _NAME = re.compile(r"checkpoint-(\d{9,})\.safetensors")
 
-State = dict[str, Any]
 
-
-def save_checkpoint(folder: Path, step: int, tensors: dict[str, torch.Tensor], state: State) -> None:
+def save_checkpoint(folder: Path, step: int, tensors: dict[str, torch.Tensor], state: JsonObject) -> None:
     """Write checkpoint-<step>.safetensors, whole or not at all."""
     saved = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     # one key, because safetensors writes several in any order, and a run's bytes should depend on the run alone
@@ -38,7 +35,7 @@ def steps(folder: Path) -> list[int]:
     return sorted((int(match[1]) for match in matches if match), reverse=True)
 
 
-def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], State] | None:
+def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], JsonObject] | None:
     """Read one checkpoint; None (and a line on stderr) if it is damaged.
 
     Raises:
@@ -62,11 +59,11 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], S
         return None
 
 
-def _sha256(tensors: dict[str, torch.Tensor], state: State) -> str:
+def _sha256(tensors: dict[str, torch.Tensor], state: JsonObject) -> str:
     return content_sha256({name: tensor.numpy() for name, tensor in tensors.items()}, state)
 
 
-def load_newest(folder: Path) -> tuple[dict[str, torch.Tensor], State] | None:
+def load_newest(folder: Path) -> tuple[dict[str, torch.Tensor], JsonObject] | None:
     """Read the newest checkpoint that is not damaged, or return None."""
     return next((checkpoint for step in steps(folder) if (checkpoint := load_checkpoint(folder, step))), None)
 

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+Evaluations = Mapping[int, Sequence[tuple[float, int]]]  # {step: [(return, length) of each episode]}
+
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
     """Return the mean of `values` and its 95% interval (Student's t).
@@ -30,17 +32,13 @@ def normalize(value: float, low: float, high: float) -> float:
 LAST = 10  # evaluations that a run's score is the mean of
 
 
-def window(evaluations: Mapping[int, Sequence[tuple[float, int]]]) -> tuple[int, ...]:
+def window(evaluations: Evaluations) -> tuple[int, ...]:
     """Return the steps of the evaluations that a run's score is the mean of: its last 10."""
     return tuple(sorted(evaluations)[-LAST:])
 
 
-def run_return(evaluations: Mapping[int, Sequence[tuple[float, int]]]) -> float:
-    """Return a run's mean return over its last 10 evaluations (never its best checkpoint).
-
-    Args:
-        evaluations: {step: [(return, length) of each episode]}.
-    """
+def run_return(evaluations: Evaluations) -> float:
+    """Return a run's mean return over its last 10 evaluations (never its best checkpoint)."""
     means = [np.mean([value for value, _ in evaluations[step]]) for step in window(evaluations)]
     return float(np.mean(means))
 

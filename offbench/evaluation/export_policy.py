@@ -5,7 +5,6 @@ import io
 import json
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -101,17 +100,17 @@ def _torchscript(policy: Policy, origin: str) -> bytes:
 def _onnx(policy: Policy, origin: str) -> bytes:
     """Return `Actor` as an ONNX graph, in float64 until its end."""
     try:
-        from onnx import TensorProto, checker, helper, numpy_helper
+        from onnx import NodeProto, TensorProto, checker, helper, numpy_helper
     except ImportError:
         raise OffbenchError("ONNX export needs the package onnx: pip install 'offbench[onnx]'") from None
-    constants: list[Any] = []
-    nodes: list[Any] = []
+    constants: list[TensorProto] = []
+    nodes: list[NodeProto] = []
 
-    def constant(array: Any) -> str:
+    def constant(array: Array | np.float64) -> str:
         constants.append(numpy_helper.from_array(np.ascontiguousarray(array), f"c{len(constants)}"))
         return f"c{len(constants) - 1}"
 
-    def node(kind: str, *inputs: str, output: str = "", **attributes: Any) -> str:
+    def node(kind: str, *inputs: str, output: str = "", **attributes: int) -> str:
         output = output or f"x{len(nodes)}"
         nodes.append(helper.make_node(kind, inputs, [output], **attributes))
         return output

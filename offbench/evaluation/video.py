@@ -12,12 +12,11 @@ import io
 import json
 import os
 import warnings
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
 
 from offbench.agents.ladder import BEHAVIOUR, find_ladder
@@ -26,7 +25,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import disk_errors, output_file, write_bytes
 from offbench.common.seeds import Purpose
 from offbench.data.levels import SINGLE, parse_level
-from offbench.envs.environments import make_env, time_limit
+from offbench.envs.environments import Env, make_env, spaces_of, time_limit
 from offbench.envs.recipes import load_recipe
 from offbench.evaluation.evaluate import open_policy
 from offbench.evaluation.renderer import NO_RENDERER, drawing_with, working_backend
@@ -101,10 +100,8 @@ def _policy_of(path: str, env: str | None) -> tuple[Policy, str, bool]:
     source = SINGLE.get(level) or parse_level(level)[1][0].source
     spec = recipe.env_spec()
     if source == "uniform":
-        world = make_env(spec)
-        space, shape = world.action_space, world.observation_space.shape
-        world.close()
-        return uniform(space.low, space.high, shape[0], recipe.env_id), spec, True  # type: ignore[attr-defined, index]
+        observations, actions = spaces_of(make_env(spec), recipe.env_id)
+        return uniform(actions.low, actions.high, observations.shape[0], recipe.env_id), spec, True
     if source == "replay" or level == "medium-expert":
         raise OffbenchError(f"{level} is not of one policy; choose random, medium, expert or a fraction")
     ladder = find_ladder(recipe)
@@ -117,7 +114,7 @@ def _policy_of(path: str, env: str | None) -> tuple[Policy, str, bool]:
     return ladder.load(rung), spec, True
 
 
-def _renderable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
+def _renderable(spec: str, backend: str | None) -> Env:
     """Make the environment for rendering. Raises OffbenchError if it cannot be rendered here."""
     try:
         with warnings.catch_warnings():
@@ -142,7 +139,7 @@ def _renderable(spec: str, backend: str | None) -> gym.Env[Any, Any]:
 class _Recording:
     """What to record: environment, policy, whether to sample actions, steps per frame, longer side in pixels."""
 
-    env: gym.Env[Any, Any]
+    env: Env
     policy: Policy
     sampled: bool
     every: int
@@ -174,7 +171,7 @@ def _episode(recording: _Recording, seed: int, index: int, most: float) -> Gener
     return count
 
 
-def _frame(env: gym.Env[Any, Any], step: int, total: float, size: int) -> Image:
+def _frame(env: Env, step: int, total: float, size: int) -> Image:
     """Render the environment's current state, with step and return on it."""
     from PIL import Image, ImageDraw, ImageFont
 
@@ -209,7 +206,7 @@ def _gif(path: Path, frames: Iterator[Image], fps: float) -> None:
     write_bytes(path, data.getvalue())
 
 
-def _encoder() -> Any:
+def _encoder() -> Callable[[Path, Iterator[Image], float], None]:
     try:
         import imageio_ffmpeg
     except ImportError:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import base64
 import importlib.resources
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from offbench.analysis.results import Results, Task, Trained
 from offbench.common.errors import OffbenchError
-from offbench.common.files import read_json
+from offbench.common.files import JsonObject, read_json
 from offbench.common.tables import Cell, Table
 from offbench.data import minari_store, transitions
 from offbench.reports.markup import Markup, join, tag
@@ -94,7 +92,7 @@ def _card(env: str) -> Markup | None:
     return join(*parts)
 
 
-def _facts(values: Mapping[str, Any]) -> list[tuple[str, float | None]]:
+def _facts(values: JsonObject) -> list[tuple[str, float | None]]:
     numbers: list[tuple[str, float | None]] = [
         (f"{values[key]:,}", values[key]) for key in ("transitions", "episodes")
     ]

@@ -10,21 +10,27 @@ import io
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from offbench.analysis.methods import Method
 from offbench.analysis.results import REFERENCES, Entry, Results, Task
 from offbench.analysis.statistics import Estimate, Scores, curve, iqm, profile
+from offbench.common.arrays import Array
 from offbench.common.scores import LAST
 from offbench.common.text import compact
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+    from matplotlib.typing import LineStyleType
 
 INK = "#21252b"  # text and axes; the page replaces it by its own text color
 GRID = "#8b93a0"
 # read on white and on near-black, and by the color-blind (after Okabe and Ito)
 COLORS = ("#2f7fc1", "#d0700f", "#1c9a72", "#c2588f", "#8a6fd1", "#b58a00", "#d1495b", "#6b7785")
-STYLES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)))
+STYLES: tuple[LineStyleType, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)))
 SIZE = (4.4, 2.9)
 PROFILE_POINTS = 121
 
@@ -35,7 +41,7 @@ class Line:
 
     label: str
     color: str
-    style: Any
+    style: LineStyleType
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ def curve_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
     task = entries[0].task
     ends = []
 
-    def paint(axes: Any) -> None:
+    def paint(axes: Axes) -> None:
         for entry in entries:
             steps, values = entry.drawn_curve()
             if steps:
@@ -93,7 +99,7 @@ def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
     """Draw one task's final scores: a dot per seed, a bar for their mean."""
     task = entries[0].task
 
-    def paint(axes: Any) -> None:
+    def paint(axes: Axes) -> None:
         for row, entry in enumerate(entries):
             color = looks[entry.method].color
             axes.plot(entry.scores, [row] * len(entry.scores), "o", color=color, alpha=0.75, markersize=5, mew=0)
@@ -110,10 +116,10 @@ def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
 def iqm_figure(iqms: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[Method, Line]) -> Figure:
     """Draw every method's IQM with its interval."""
 
-    def paint(axes: Any) -> None:
+    def paint(axes: Axes) -> None:
         for row, (method, (estimate, _)) in enumerate(iqms.items()):
             color = looks[method].color
-            if estimate.low is not None:
+            if estimate.low is not None and estimate.high is not None:
                 axes.plot([estimate.low, estimate.high], [row, row], color=color, linewidth=7, alpha=0.35)
             axes.plot([estimate.value] * 2, [row - 0.3, row + 0.3], color=color, linewidth=2.5)
         _named_rows(axes, [looks[method].label for method in iqms])
@@ -129,7 +135,7 @@ def profile_figure(iqms: Mapping[Method, tuple[Estimate, Scores]], looks: Mappin
     every = [value for _, scores in iqms.values() for values in scores.values() for value in values]
     taus = np.linspace(min(0.0, min(every)), max(100.0, max(every)), PROFILE_POINTS)
 
-    def paint(axes: Any) -> None:
+    def paint(axes: Axes) -> None:
         for method, (_, scores) in iqms.items():
             _band(axes, taus.tolist(), profile(scores, taus.tolist()), looks[method])
         axes.set(xlabel="normalized score τ", ylabel="fraction of runs above τ", ylim=(-0.02, 1.02))
@@ -147,7 +153,7 @@ def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure |
         The figure, or None if no method has evaluations at a step of all tasks.
     """
     tasks = {task.name for task in results.tasks if task.reference}
-    whole: dict[Method, tuple[list[int], dict[str, Any]]] = {}
+    whole: dict[Method, tuple[list[int], dict[str, tuple[list[int], Array]]]] = {}
     for method in results.methods:
         curves = {e.task.name: e.drawn_curve() for e in results.of(method) if e.task.reference}
         steps = sorted(set.intersection(*(set(curve[0]) for curve in curves.values()))) if curves else []
@@ -156,7 +162,7 @@ def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure |
     if not whole:
         return None
 
-    def paint(axes: Any) -> None:
+    def paint(axes: Axes) -> None:
         for method, (shown, curves) in whole.items():
             points = [iqm({t: v[:, s.index(step)].tolist() for t, (s, v) in curves.items()}, 2000) for step in shown]
             _band(axes, shown, points, looks[method])
@@ -179,7 +185,7 @@ def loss_figure(
         ends.append(f"{method.label} {values.mean(0)[-1]:.3g} at {steps[-1]:,}")
         shown.append(looks[method])
 
-    def paint(axes: Any) -> None:
+    def paint(axes: Axes) -> None:
         for method, (steps, values) in series.items():
             mean, low, high = values.mean(0), values.min(0), values.max(0)
             points = [Estimate(*map(float, row)) for row in zip(mean, low, high, strict=True)]
@@ -192,7 +198,7 @@ def loss_figure(
     return _draw(name, "Mean over seeds, range shaded.", alt, paint, shown)
 
 
-def _column(entry: Entry, column: str) -> tuple[list[int], np.ndarray[Any, Any]] | None:
+def _column(entry: Entry, column: str) -> tuple[list[int], Array] | None:
     """Return (steps, values [runs, steps]) of the rows that all runs have; long series are thinned."""
     series = [
         {int(row["step"]): row[column] for row in t.run.losses() if {"step", column} <= row.keys()} for t in entry.runs
@@ -204,16 +210,16 @@ def _column(entry: Entry, column: str) -> tuple[list[int], np.ndarray[Any, Any]]
     return steps, np.array([[run[step] for step in steps] for run in series])
 
 
-def _band(axes: Any, x: Sequence[float], points: Sequence[Estimate], look: Line) -> None:
+def _band(axes: Axes, x: Sequence[float], points: Sequence[Estimate], look: Line) -> None:
     values = [point.value for point in points]
     marker = "o" if len(x) == 1 else ""
     axes.plot(x, values, color=look.color, linestyle=look.style, linewidth=1.6, marker=marker, markersize=4)
     if all(point.low is not None for point in points):
-        low, high = [point.low for point in points], [point.high for point in points]
+        low, high = np.array([(point.low, point.high) for point in points], float).T
         axes.fill_between(x, low, high, color=look.color, alpha=0.16, linewidth=0)
 
 
-def _named_rows(axes: Any, names: Sequence[str]) -> None:
+def _named_rows(axes: Axes, names: Sequence[str]) -> None:
     axes.set_yticks(range(len(names)), [_two_lines(name) for name in names])
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
@@ -244,7 +250,7 @@ def _draw(
     name: str,
     caption: str,
     alt: str | Callable[[], str],
-    paint: Callable[[Any], None],
+    paint: Callable[[Axes], None],
     legend: Sequence[Line] = (),
 ) -> Figure:
     """Draw a figure and keep it three ways. `alt` may be a function, called after the painting."""
@@ -276,7 +282,7 @@ def _draw(
     return Figure(name, caption, alt() if callable(alt) else alt, png, svg, _for_page(inline, name), tuple(legend))
 
 
-def _saved(fig: Any, kind: str) -> bytes:
+def _saved(fig: Canvas, kind: str) -> bytes:
     data = io.BytesIO()
     # no date and no version: the same runs give the same bytes
     nothing = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None, "Format": None, "Type": None}}

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +17,7 @@ from torch import Tensor
 
 from offbench.algorithm.interface import NOT_LOADED, Batch, NoiseSpec
 from offbench.common import seeds
+from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import Purpose
 from offbench.data.transitions import Transitions
@@ -106,7 +106,7 @@ class Store:
         )
 
 
-def _tensor(array: Any) -> Tensor:
+def _tensor(array: Array) -> Tensor:
     with warnings.catch_warnings():
         # PyTorch warns that the cache is mapped read-only; nothing here writes to it
         warnings.simplefilter("ignore", UserWarning)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Hashable, Mapping
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -39,7 +38,7 @@ class Program:
         self._recordings: dict[Hashable, Recording] = {}
         self._done: dict[Hashable, int] = {}  # updates of each phase
         self.eager = not algorithm.capture  # whether every update runs without capture
-        self._side: Any = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
+        self._side = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
 
     def load(self, indices: Tensor, noise: Mapping[str, Tensor], first: int) -> None:
         """Copy a chunk's indices and noise into the buffers; the next update takes row `first`."""
@@ -104,7 +103,7 @@ class Program:
         name = type(self.algorithm).__name__
         print(f"offbench: {name}.update {reason}: updates run without capture, which is slower", file=sys.stderr)
 
-    def _warm_up(self, phase: Hashable, side: Any) -> None:
+    def _warm_up(self, phase: Hashable, side: torch.cuda.Stream) -> None:
         """Do one of the first updates of a phase as it is; after a few, capture the phase for those to come."""
         done = self._done[phase] = self._done.get(phase, 0) + 1
         before = attributes(self.algorithm)

@@ -19,12 +19,11 @@ import numpy as np
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import disk_errors, read_json, write_json
-from offbench.common.scores import normalize
+from offbench.common.scores import Evaluations, normalize
 from offbench.common.settings import read_back
 from offbench.training.run import Run
 
 Losses = Sequence[Mapping[str, float]]
-Evaluations = Mapping[int, Sequence[tuple[float, int]]]
 
 
 @dataclass(frozen=True)

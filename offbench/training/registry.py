@@ -11,17 +11,17 @@ import functools
 import importlib
 import importlib.metadata
 import json
+import operator
 import os
 import re
 import sys
 import traceback
 import types
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, drawing_variable, unknown
-from offbench.common.files import OPEN_FILES
+from offbench.common.files import OPEN_FILES, JsonObject
 
 if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
@@ -33,7 +33,7 @@ _own: dict[str, type[Algorithm]] = {}  # this process's own algorithms
 
 NEEDED = ("batch_size", "normalize")  # settings that the training itself reads
 # Settings of earlier versions, which bdb_plus has now, and the values under which a run trains as without them.
-FORMER_SETTINGS: dict[str, dict[str, Any]] = {
+FORMER_SETTINGS: dict[str, JsonObject] = {
     "bdb": {
         "uncertainty": "absolute",
         "uncertainty_scale": 1.0,
@@ -128,10 +128,7 @@ def load_algorithm(name: str) -> type[Algorithm]:
         if name not in own:
             raise unknown("algorithm", name, points)
         module, _, qualname = own[name].partition(":")
-        cls: Any = importlib.import_module(module)
-        for part in qualname.split("."):
-            cls = getattr(cls, part)
-        return _own.setdefault(name, cls)
+        return _own.setdefault(name, operator.attrgetter(qualname)(importlib.import_module(module)))
     point, *others = points[name]
     if others:
         raise OffbenchError(f"two algorithms are named {name!r}: {point.value} and {others[0].value}; rename yours")
@@ -231,7 +228,7 @@ def _checked(kind: type, what: str) -> type[Algorithm]:
     return kind
 
 
-def current_settings(algorithm: str, settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+def current_settings(algorithm: str, settings: JsonObject, where: str) -> JsonObject:
     """Return a run's recorded settings without those that its algorithm had in an earlier version only.
 
     Raises:

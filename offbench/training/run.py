@@ -16,13 +16,13 @@ import csv
 import dataclasses
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import (
+    JsonObject,
     csv_bytes,
     damage,
     exclusive_lock,
@@ -33,6 +33,7 @@ from offbench.common.files import (
     write_json,
 )
 from offbench.common.provenance import Hardware, MadeWith
+from offbench.common.scores import Evaluations
 from offbench.common.settings import read_back
 from offbench.training.registry import current_settings
 from offbench.training.source_code import changes
@@ -44,8 +45,6 @@ DIGITS = 8  # of a content hash, where a table must tell two contents of one dat
 LARGEST = 1e15  # what no step, return or reference reaches: scores and their squares stay finite
 SMALLEST_GAP = 1e-12  # between the references of a score
 MUST_MATCH = ("algorithm", "settings", "dataset", "dataset_sha256", "seed", "eval_every", "eval_episodes")
-
-Evaluations = Mapping[int, list[tuple[float, int]]]  # {step: [(return, length) of each episode]}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +79,7 @@ class RunConfig:
     format: str = FORMAT
     algorithm: str
     variant: str
-    settings: dict[str, Any]
+    settings: JsonObject
     dataset: str
     dataset_sha256: str
     seed: int
@@ -321,7 +320,7 @@ def _count(text: str) -> int:
     return int(text)
 
 
-def _short(value: Any) -> Any:
+def _short(value: object) -> object:
     return f"{value:.6g}" if isinstance(value, float) else value
 
 

@@ -18,7 +18,7 @@ import sys
 import tokenize
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from offbench.common.files import sha256
 from offbench.training.registry import load_algorithm
@@ -66,15 +66,15 @@ def _code_of(kind: type[Algorithm]) -> dict[str, str]:
     return dict(sorted(hashes.items()))
 
 
-def changes(before: Any, now: Mapping[str, str]) -> str:
+def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Return what differs between two `code_of`, for an error line; "" for nothing, or if either is missing."""
-    if not isinstance(before, dict) or not before or not now:
+    if not before or not now:
         return ""
     differ = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     return ", ".join(f"{name} {_how(before.get(name), now.get(name))}" for name in differ)
 
 
-def _how(before: Any, now: str | None) -> str:
+def _how(before: str | None, now: str | None) -> str:
     if now is None:
         return "is gone"
     if before is None:

@@ -11,15 +11,18 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, TypeGuard
 from urllib.parse import quote
 
 from offbench.common.errors import OffbenchError, unknown
-from offbench.common.files import sha256
+from offbench.common.files import JsonObject, sha256
 from offbench.common.settings import check, fields, setting
 from offbench.training.loggers import NOWHERE, Destinations
 from offbench.training.registry import load_algorithm, use
 from offbench.training.run import Run
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 LONGEST = 255  # bytes of a file's name, on the usual file systems
 
@@ -51,7 +54,7 @@ class RunSpec:
     """
 
     algorithm: str
-    config: Any
+    config: DataclassInstance
     dataset: str
     seed: int
     steps: int
@@ -122,7 +125,7 @@ class Job:
 
 def specs_of(
     algorithm: str | type,
-    settings: Mapping[str, Any],
+    settings: Mapping[str, object],
     datasets: Sequence[str],
     times: Times,
     runs: Path,
@@ -172,7 +175,9 @@ def specs_of(
     return variants
 
 
-def configurations(cls: type, settings: Mapping[str, Any], algorithm: str) -> list[Any]:
+def configurations(
+    cls: type[DataclassInstance], settings: Mapping[str, object], algorithm: str
+) -> list[DataclassInstance]:
     """Return the different configs of the product of all lists in `settings`. Raises OffbenchError for a bad one."""
     valid, columns = fields(cls), []
     for name, value in settings.items():
@@ -187,14 +192,14 @@ def configurations(cls: type, settings: Mapping[str, Any], algorithm: str) -> li
     return list(dict.fromkeys(cls(**dict(row)) for row in itertools.product(*columns)))
 
 
-def _is_varied(value: Any, default: Any) -> bool:
+def _is_varied(value: object, default: object) -> TypeGuard[Sequence[object]]:
     """Return whether a list holds values of a setting, rather than being one value, as (64, 64) is of `hidden`."""
     if not isinstance(value, list | tuple):
         return False
     return not isinstance(default, tuple) or any(isinstance(item, list | tuple | str) for item in value)
 
 
-def _check_lists(values: Sequence[Any], what: str) -> None:
+def _check_lists(values: Sequence[object], what: str) -> None:
     """Refuse `64 64`, which may mean one network of two layers or two of one."""
     if any(isinstance(item, str) and not re.search("[,x]", item) for item in values):
         typed = [str(item) for item in values]
@@ -216,7 +221,7 @@ def folder_name(variant: str) -> str:
     return variant.encode()[: LONGEST - len(ending)].decode(errors="ignore") + ending
 
 
-def variant(config: Any, precision: str = "float32") -> str:
+def variant(config: DataclassInstance, precision: str = "float32") -> str:
     """Name a config by the settings that differ from their defaults: `default` or `alpha=1,beta=0.5`.
 
     A precision other than float32 is the last of them: `beta=0.5,precision=bfloat16`.
@@ -231,7 +236,7 @@ def variant(config: Any, precision: str = "float32") -> str:
     return ",".join(parts) or "default"
 
 
-def _setting_text(value: Any) -> str:
+def _setting_text(value: object) -> str:
     if isinstance(value, tuple):
         return "x".join(str(item) for item in value)
     if isinstance(value, float):
@@ -239,7 +244,6 @@ def _setting_text(value: Any) -> str:
     return quote(value, safe="") if isinstance(value, str) else str(value).lower()
 
 
-def settings_json(config: Any) -> dict[str, Any]:
+def settings_json(config: DataclassInstance) -> JsonObject:
     """Return a config as config.json stores it (tuples become lists)."""
-    values: Mapping[str, Any] = dataclasses.asdict(config)
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(config).items()}

@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from offbench.algorithm.interface import Algorithm
 from offbench.common import checkpoints
@@ -48,7 +47,7 @@ def train(
     wandb: str | None = None,
     fresh: bool = False,
     command: str = "",
-    **settings: Any,
+    **settings: object,
 ) -> list[Path]:
     """Train one algorithm on one or more datasets, or resume the runs from their newest checkpoints.
 
@@ -206,7 +205,7 @@ def restore(run: Run, algorithm: str | type | None = None) -> Stack:
     recorded = current_settings(config.algorithm, config.settings, str(run.folder))
     if changed := changes(config.code, code_of(config.algorithm)):
         raise OffbenchError(f"{run.folder} was trained by other code of {config.algorithm}: {changed}")
-    settings: Any = build(kind.Config, recorded, f"{run.config_path}: settings")
+    settings = build(kind.Config, recorded, f"{run.config_path}: settings")
     data = transitions.load(config.dataset)
     if data.content != config.dataset_sha256:
         raise OffbenchError(f"{data.dataset_id} is no longer the dataset that {run.folder} was trained on")

@@ -13,12 +13,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
-from typing import Any
 
 import numpy as np
 
 from offbench.common import checkpoints
-from offbench.common.files import disk_errors
+from offbench.common.files import JsonObject, disk_errors
 from offbench.common.interrupts import stops_noted
 from offbench.common.provenance import made_with
 from offbench.common.scores import normalize
@@ -181,7 +180,7 @@ class Trainer:
                 run.write_evaluations(self.evaluations[i])
                 run.write_losses(self.losses[i])
                 self.stack.policy(i).save(run.policy_path)
-                state: dict[str, Any] = {"step": step}
+                state: JsonObject = {"step": step}
                 unlogged = self.stack.program.unlogged(i)
                 if unlogged:  # stopped by the clock, between two rows of losses.csv
                     state["unlogged"] = unlogged
