@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import functools
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 from offbench.cli.arguments import Parser, completed
+from offbench.common.settings import Field, fields
 
 OPTIMIZATION = ("batch_size", "discount", "tau", "policy_freq", "normalize")  # settings that every method has
 
 
 def add_settings(parser: Parser, algorithm: str) -> type:
     """Add an algorithm's own settings, in groups. Returns its Config."""
-    from offbench.common.settings import fields
     from offbench.training.registry import load_algorithm, use
 
     config = load_algorithm(use(algorithm)).Config
@@ -24,7 +22,7 @@ def add_settings(parser: Parser, algorithm: str) -> type:
         "optimization": f"optimization of {algorithm}",
         "ours": "extensions that are not in the paper",
     }
-    groups: dict[str, Any] = {}
+    groups = {}
     members = fields(config)
     for kind, title in titles.items():
         for name, field in members.items():
@@ -44,14 +42,14 @@ def add_settings(parser: Parser, algorithm: str) -> type:
     return config
 
 
-def _kind(name: str, field: dataclasses.Field[Any]) -> str:
+def _kind(name: str, field: Field) -> str:
     """Return the group of a setting in the help: `method`, `optimization` or `ours`."""
     if field.metadata.get("help", "").startswith("ours"):
         return "ours"
     return "optimization" if name in OPTIMIZATION or name.endswith(("learning_rate", "hidden")) else "method"
 
 
-def _help(field: dataclasses.Field[Any]) -> str:
+def _help(field: Field) -> str:
     """Return a setting's help, with the words that it may be and its default."""
     words = " | ".join(field.metadata.get("choices") or ())
     default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else str(field.default)
@@ -60,10 +58,8 @@ def _help(field: dataclasses.Field[Any]) -> str:
     )
 
 
-def notices(config: type, settings: Mapping[str, Any]) -> Iterator[str]:
+def notices(config: type, settings: Mapping[str, object]) -> Iterator[str]:
     """Return what a user should know of the values of settings, as the algorithm's fields have it."""
-    from offbench.common.settings import fields
-
     for name, field in fields(config).items():
         values = settings.get(name, [field.default])
         for value, text in field.metadata.get("notes", {}).items():

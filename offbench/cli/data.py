@@ -6,6 +6,7 @@ import sys
 from json import dumps
 from typing import Any
 
+import offbench
 from offbench.cli.arguments import Parser, completed, levels, local_datasets, natural, recipes, trust, whole
 from offbench.common.terminal import hint, print_table, say
 
@@ -34,9 +35,7 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
     _behaviour_dir(parser)
 
     def run(**arguments: Any) -> None:
-        from offbench.data.collect import collect
-
-        dataset_id = collect(**arguments)
+        dataset_id = offbench.collect(**arguments)
         print(dataset_id)
         hint("offbench", "train", "td3_bc", "--dataset", dataset_id)
 
@@ -53,11 +52,10 @@ def behaviour_arguments(parser: Parser, _: list[str]) -> None:
     _behaviour_dir(parser)
 
     def run(**arguments: Any) -> None:
-        from offbench.agents.behaviour import behaviour
         from offbench.data.other_references import warn_other_references
         from offbench.envs.recipes import load_recipe
 
-        ladder = behaviour(**arguments)
+        ladder = offbench.behaviour(**arguments)
         warn_other_references(load_recipe(arguments["env"]), ladder)
         print(f"ladder in {ladder.folder}: random {ladder.random_return:.1f}, expert {ladder.expert_return:.1f}")
         rows = [
@@ -90,9 +88,9 @@ def list_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(what: str | None, runs: str, json: bool) -> None:
-        from offbench.tools.inventory import inventory, sections
+        from offbench.tools.inventory import sections
 
-        contents = inventory(what, runs=runs)
+        contents = offbench.inventory(what, runs=runs)
         if json:
             print(dumps(contents, indent=1))
             return
@@ -113,9 +111,7 @@ def show_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--plot", metavar="PICTURE", help="also draw the histogram of returns (.png, .svg, .pdf)")
 
     def run(dataset_id: str, plot: str | None) -> None:
-        from offbench.data.show import show
-
-        summary = show(dataset_id)
+        summary = offbench.show(dataset_id)
         picture = summary.plot(plot) if plot else None
         print("\n".join(summary.lines()))
         if picture:
@@ -144,15 +140,11 @@ def card_arguments(parser: Parser, _: list[str]) -> None:
 
     def run(about: str, huggingface: bool, out: str | None, behaviour_dir: str) -> None:
         if huggingface:
-            from offbench.data.huggingface_card import huggingface_card
-
-            print(f"saved {huggingface_card(about, out)}")
+            print(f"saved {offbench.huggingface_card(about, out)}")
         elif about in local_datasets():
             parser.error(f"{about} is a dataset: give --huggingface, or an environment")
         else:
-            from offbench.data.card import card
-
-            print(f"saved {card(about, out, behaviour_dir)}")
+            print(f"saved {offbench.card(about, out, behaviour_dir)}")
 
     parser.set_defaults(run=run)
 
@@ -166,9 +158,7 @@ def verify_arguments(parser: Parser, _: list[str]) -> None:
     trust(parser)
 
     def run(as_json: bool, **arguments: Any) -> None:
-        from offbench.verification.verify import verify
-
-        report = verify(**arguments)
+        report = offbench.verify(**arguments)
         print(report.to_json() if as_json else "\n".join(report.lines()))
         if not report.ok:
             sys.exit(1)
@@ -189,9 +179,7 @@ def import_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset with the same id")
 
     def run(**arguments: Any) -> None:
-        from offbench.data.import_d4rl import import_d4rl
-
-        dataset_id = import_d4rl(**arguments)
+        dataset_id = offbench.import_d4rl(**arguments)
         print(dataset_id)
         hint("offbench", "show", dataset_id)
 
@@ -213,9 +201,4 @@ def export_arguments(parser: Parser, _: list[str]) -> None:
         "--drop-timeouts", action="store_true", help="npz: leave out the steps that D4RL's qlearning_dataset drops"
     )
 
-    def run(**arguments: Any) -> None:
-        from offbench.data.export import export
-
-        print(f"saved {export(**arguments)}")
-
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=lambda **options: print(f"saved {offbench.export(**options)}"))

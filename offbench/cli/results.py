@@ -6,9 +6,11 @@ import sys
 from json import dumps
 from typing import Any
 
+import offbench
 from offbench.cli.arguments import Parser, completed, local_datasets, methods, natural, number, recipes, trust, whole
 from offbench.common.files import JsonObject
 from offbench.common.terminal import is_terminal, note, print_table, say
+from offbench.common.text import counted
 
 RUNS_HELP = "folder of the runs (default: runs)"
 
@@ -31,11 +33,9 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--plot", metavar="PICTURE", help="also draw the learning curves (.png, .svg, .pdf)")
 
     def run(style: str, plot: str | None, **arguments: Any) -> None:
-        from offbench.analysis.normalize import count_waiting, normalize_runs_or_returns
-        from offbench.common.text import counted
+        from offbench.analysis.normalize import count_waiting
 
-        rows = normalize_runs_or_returns(**arguments)
-        print_scores(rows, style)
+        print_scores(offbench.normalize(**arguments), style)
         waiting = 0 if arguments["env"] else count_waiting(arguments["runs"])
         if waiting:
             note(f"{counted(waiting, 'run')} without an evaluation yet")
@@ -73,12 +73,7 @@ def report_arguments(parser: Parser, _: list[str]) -> None:
     only = parser.add_argument("--methods", nargs="+", metavar="NAME", help="only these methods, as tables name them")
     completed(only, methods)
 
-    def run(**arguments: Any) -> None:
-        from offbench.reports.report import report
-
-        print(f"saved {report(**arguments)}")
-
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=lambda **options: print(f"saved {offbench.report(**options)}"))
 
 
 def compare_arguments(parser: Parser, _: list[str]) -> None:
@@ -91,9 +86,7 @@ def compare_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(json: bool, **arguments: Any) -> None:
-        from offbench.analysis.compare import compare
-
-        comparison = compare(**arguments)
+        comparison = offbench.compare(**arguments)
         print(dumps(comparison.row(), indent=1) if json else "\n".join(comparison.lines()))
 
     parser.set_defaults(run=run)
@@ -119,16 +112,6 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--workers", type=whole, help="processes (default: one per core)")
     trust(parser)
 
-    def similar(path: str, **options: Any) -> None:
-        from offbench.evaluation.similarity import similarity
-
-        result = similarity(path, **options)
-        print(f"{path}: similar score at step {result.step:,} over {result.samples:,} transitions")
-        print(f"by Q       {result.q_similar:.2f}%  (within {100 * result.tolerance:g}% of |Q1(s, a)|)")
-        print(
-            f"by action  {result.action_similar:.2f}%  (root mean square distance at most {result.action_tolerance:g})"
-        )
-
     def run(
         paths: list[str],
         similarity: bool,
@@ -137,16 +120,22 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
         action_tolerance: float,
         **arguments: Any,
     ) -> None:
-        from offbench.evaluation.evaluate import evaluate
-
         for path in paths:
             if similarity:
-                reading = {"tolerance": tolerance, "action_tolerance": action_tolerance, "algorithm": algorithm}
-                similar(path, seed=arguments["seed"], **reading)
+                _similar(path, arguments["seed"], algorithm, tolerance, action_tolerance)
             else:
-                print("\n".join(([path] if len(paths) > 1 else []) + evaluate(path, **arguments).lines()))
+                print("\n".join(([path] if len(paths) > 1 else []) + offbench.evaluate(path, **arguments).lines()))
 
     parser.set_defaults(run=run)
+
+
+def _similar(path: str, seed: int, algorithm: str | None, tolerance: float, action_tolerance: float) -> None:
+    from offbench.evaluation.similarity import similarity
+
+    result = similarity(path, seed=seed, algorithm=algorithm, tolerance=tolerance, action_tolerance=action_tolerance)
+    print(f"{path}: similar score at step {result.step:,} over {result.samples:,} transitions")
+    print(f"by Q       {result.q_similar:.2f}%  (within {100 * tolerance:g}% of |Q1(s, a)|)")
+    print(f"by action  {result.action_similar:.2f}%  (root mean square distance at most {action_tolerance:g})")
 
 
 def video_arguments(parser: Parser, _: list[str]) -> None:
@@ -161,12 +150,7 @@ def video_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--size", type=whole, default=480, help="longer side in pixels (default: 480)")
     trust(parser)
 
-    def run(**arguments: Any) -> None:
-        from offbench.evaluation.video import video
-
-        print(f"saved {video(**arguments)}")
-
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=lambda **options: print(f"saved {offbench.video(**options)}"))
 
 
 def export_policy_arguments(parser: Parser, _: list[str]) -> None:
@@ -174,9 +158,4 @@ def export_policy_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run directory or a policy file")
     parser.add_argument("--out", required=True, metavar="FILE", help="the file to write: .pt (TorchScript) or .onnx")
 
-    def run(**arguments: Any) -> None:
-        from offbench.evaluation.export_policy import export_policy
-
-        print(f"saved {export_policy(**arguments)}")
-
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=lambda **options: print(f"saved {offbench.export_policy(**options)}"))

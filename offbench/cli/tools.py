@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from json import dumps
 
+import offbench
 from offbench.cli.arguments import Parser
 from offbench.common.terminal import print_table
 
@@ -16,9 +17,9 @@ def doctor_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(json: bool) -> None:
-        from offbench.tools.doctor import BROKEN, OK, as_json, doctor
+        from offbench.tools.doctor import BROKEN, OK, as_json
 
-        findings = doctor()
+        findings = offbench.doctor()
         if json:
             print(dumps(as_json(findings), indent=1))
         else:

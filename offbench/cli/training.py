@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
+import offbench
 from offbench.cli.algorithm_flags import add_settings, moved_flag, notices
 from offbench.cli.arguments import Parser, auto, completed, local_datasets, recipes, seed_list, share, trust, whole
 from offbench.cli.results import print_scores
@@ -53,14 +54,13 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
 
     def run(**arguments: Any) -> None:
         from offbench.training.run import Run
-        from offbench.training.train import train
 
         settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
         rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
         rest["algorithm"], settings = algorithm, named | settings
         if moved:
             note(f"{moved} is an option of bdb_plus, no longer of bdb: training bdb_plus")
-        folders = train(**rest, **settings, command=shlex.join(["offbench", "train", *words]))
+        folders = offbench.train(**rest, **settings, command=shlex.join(["offbench", "train", *words]))
         for folder in folders:
             print(folder)
         for text in notices(config, settings):
@@ -143,7 +143,6 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
         **arguments: Any,
     ) -> None:
         from offbench.analysis import normalize
-        from offbench.benchmarks.benchmark import benchmark
         from offbench.benchmarks.plan import Plan, prepare
 
         if plan:
@@ -157,7 +156,7 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
             where = RayExecutor(address)
             arguments["workers"] = arguments["workers"] or where.cpus
         bench = prepare(**arguments)
-        finished = benchmark(bench, budget=budget, shard=shard, executor=where, command=command)
+        finished = offbench.benchmark(bench, budget=budget, shard=shard, executor=where, command=command)
         if rows := normalize.score_some(bench.started()):  # a small budget ends before there are any
             print_scores(rows)
         runs = [] if arguments["runs"] == "runs" else ["--runs", arguments["runs"]]

@@ -14,11 +14,12 @@ import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from offbench.common.errors import DamagedError, OffbenchError, unknown
 
 T = TypeVar("T")
+Field: TypeAlias = dataclasses.Field[Any]
 _type_hints = functools.cache(typing.get_type_hints)  # evaluating them takes most of the time of reading a config.json
 
 
@@ -53,7 +54,7 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
+def fields(cls: type) -> dict[str, Field]:
     """Return the fields of a settings class by name, those that a user may set."""
     return {f.name: f for f in dataclasses.fields(cls) if not f.metadata.get("internal")}
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from offbench.agents.ladder import read_ladder
 from offbench.common.errors import OffbenchError
+from offbench.common.files import JsonObject
 from offbench.data import minari_store
 from offbench.data.levels import LEVELS
 from offbench.envs.recipes import load_recipe, names
@@ -16,9 +17,10 @@ from offbench.training.registry import algorithm_names
 
 if TYPE_CHECKING:
     from offbench.analysis.results import Trained
+    from offbench.training.run import Run, RunConfig
 
 
-def inventory(what: str | None = None, *, runs: str | Path = "runs") -> dict[str, Any]:
+def inventory(what: str | None = None, *, runs: str | Path = "runs") -> JsonObject:
     """Return what is here.
 
     Args:
@@ -31,7 +33,7 @@ def inventory(what: str | None = None, *, runs: str | Path = "runs") -> dict[str
         OffbenchError: an unknown `what`, or the same run is there twice. Damaged runs are named on stderr and left
             out.
     """
-    parts: dict[str, Callable[[], Any]] = {
+    parts: dict[str, Callable[[], object]] = {
         "environments": _environments,
         "levels": lambda: list(LEVELS),
         "algorithms": algorithm_names,
@@ -43,7 +45,7 @@ def inventory(what: str | None = None, *, runs: str | Path = "runs") -> dict[str
     return {name: part() for name, part in parts.items() if name == what or (what is None and name != "runs")}
 
 
-def _environments() -> dict[str, Any]:
+def _environments() -> JsonObject:
     environments = {}
     for name in names():
         recipe = load_recipe(name)
@@ -56,7 +58,7 @@ def _environments() -> dict[str, Any]:
     return environments
 
 
-def _datasets() -> dict[str, Any]:
+def _datasets() -> JsonObject:
     datasets = {}
     for dataset_id in minari_store.local_ids():
         try:
@@ -72,56 +74,48 @@ def _datasets() -> dict[str, Any]:
     return datasets
 
 
-def _runs(root: str | Path) -> list[dict[str, Any]]:
+def _runs(root: str | Path) -> list[JsonObject]:
     from offbench.analysis.methods import method_of
     from offbench.analysis.results import entries_of
     from offbench.training.run import find_runs
 
     entries, waiting = entries_of(find_runs(Path(root)))
-    rows: list[dict[str, Any]] = []
-    for entry in entries:
-        rows += [
-            {
-                "dataset": entry.task.name,
-                "method": entry.method.label,
-                "seed": trained.seed,
-                "step": trained.reached,
-                "steps": trained.steps,
-                "state": trained.state,
-                "return": trained.score(None),
-                "score": _score(trained, "dataset"),
-                "d4rl_score": _score(trained, "d4rl"),
-                "folder": str(trained.run.folder),
-            }
-            for trained in entry.runs
-        ]
+    rows = [
+        _run(entry.task.name, entry.method.label, trained.run, trained.config, trained)
+        for entry in entries
+        for trained in entry.runs
+    ]
     for run in waiting:
         config = run.config()
-        rows.append(
-            {
-                "dataset": config.dataset,
-                "method": config.label or method_of(config.algorithm, config.variant, config.settings).label,
-                "seed": config.seed,
-                "step": 0,
-                "steps": config.steps,
-                "state": "diverged" if run.diverged else "unfinished",
-                "return": None,
-                "score": None,
-                "d4rl_score": None,
-                "folder": str(run.folder),
-            }
-        )
+        method = config.label or method_of(config.algorithm, config.variant, config.settings).label
+        rows.append(_run(config.dataset, method, run, config, None))
     return rows
 
 
-def _score(trained: Trained, reference: str) -> float | None:
-    return trained.score(reference) if trained.config.references.get(reference) else None
+def _run(dataset: str, method: str, run: Run, config: RunConfig, trained: Trained | None) -> JsonObject:
+    """Return a run's row; `trained` is None if it was not evaluated yet."""
+
+    def score(reference: str) -> float | None:
+        return trained.score(reference) if trained and config.references.get(reference) else None
+
+    return {
+        "dataset": dataset,
+        "method": method,
+        "seed": config.seed,
+        "step": trained.reached if trained else 0,
+        "steps": config.steps,
+        "state": trained.state if trained else "diverged" if run.diverged else "unfinished",
+        "return": trained.score(None) if trained else None,
+        "score": score("dataset"),
+        "d4rl_score": score("d4rl"),
+        "folder": str(run.folder),
+    }
 
 
 Section = tuple[str, list[str], list[list[str]]]
 
 
-def sections(contents: Mapping[str, Any]) -> Iterator[Section]:
+def sections(contents: JsonObject) -> Iterator[Section]:
     """Return `inventory` as (title, header, rows) of tables; the header is empty where rows are lines of text."""
     if "environments" in contents:
         rows = [
@@ -142,7 +136,7 @@ def sections(contents: Mapping[str, Any]) -> Iterator[Section]:
         yield _run_section(contents["runs"])
 
 
-def _run_section(runs: Sequence[Mapping[str, Any]]) -> Section:
+def _run_section(runs: Sequence[JsonObject]) -> Section:
     if not runs:
         return "runs", [], [["none; start one with `offbench train ALGO --dataset ID`"]]
     titles = {"score": "score", "d4rl_score": "D4RL score"}
@@ -158,10 +152,10 @@ def _run_section(runs: Sequence[Mapping[str, Any]]) -> Section:
     return "runs", ["dataset", "method", "seed", "step", "of", *(titles.get(k, k) for k in scores), "state"], rows
 
 
-def _transitions(data: Mapping[str, Any]) -> str:
+def _transitions(data: JsonObject) -> str:
     short = f" of {data['short_of']:,}" if data["short_of"] else ""
     return f"{data['total_steps']:,}{short}"
 
 
-def _numbers(values: Mapping[str, Any], *keys: str) -> Sequence[str]:
+def _numbers(values: JsonObject, *keys: str) -> Sequence[str]:
     return [f"{values[key]:.0f}" if values[key] is not None else "-" for key in keys]
