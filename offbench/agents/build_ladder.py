@@ -16,7 +16,6 @@ from __future__ import annotations
 import itertools
 import math
 import shutil
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -30,6 +29,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, csv_bytes, damage, disk_errors, read_json, write_bytes, write_json
 from offbench.common.provenance import versions
 from offbench.common.seeds import Purpose
+from offbench.common.terminal import inform
 from offbench.envs.environments import make_env, spaces_of
 from offbench.envs.recipes import Recipe
 from offbench.rollouts.policy import Policy, load_policy, uniform
@@ -94,7 +94,7 @@ class RungEvaluator:
             row = self._earlier["measured"].get(str(step)) or self._play(step)
             self.measured[step] = row
             self._save("measured", step, row)
-            _say(f"policy of step {step:,}: return {row['return']:.1f} over {row['episodes']} episodes")
+            inform(f"policy of step {step:,}: return {row['return']:.1f} over {row['episodes']} episodes")
         return self.measured[step]["return"]
 
     def _play(self, step: int) -> dict[str, float]:
@@ -189,7 +189,7 @@ class RungEvaluator:
         steps = [step for step in self.within if first < step < last]
         new = [step for step in steps if step not in self.screened_within]
         if new:
-            _say(f"screening {len(new)} policies between steps {first:,} and {last:,}")
+            inform(f"screening {len(new)} policies between steps {first:,} and {last:,}")
         for step in new:
             earlier = self._earlier["screened"].get(str(step))
             self.screened_within[step] = self.screen(step) if earlier is None else float(earlier)
@@ -322,7 +322,3 @@ def _table(
         values |= evaluator.measured.get(step, {})
         values |= {"role": roles.get(step, ""), "policy": folder.policy(step).name if step in roles else ""}
         yield [values[key] for key in COLUMNS]
-
-
-def _say(line: str) -> None:
-    print(f"offbench: {line}", file=sys.stderr, flush=True)

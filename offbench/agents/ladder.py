@@ -11,7 +11,6 @@ import csv
 import dataclasses
 import json
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import numpy as np
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, damage, read_json, regular
 from offbench.common.scores import normalize
+from offbench.common.terminal import inform, warn
 from offbench.envs.environments import same_environment
 from offbench.envs.recipes import Recipe, load_recipe, names
 from offbench.envs.version_warning import warn_other_physics
@@ -143,7 +143,7 @@ def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool =
         return None
     ladder.check(recipe)
     if not shipped:
-        print(f"offbench: using the behaviour agent trained here: {ladder.folder}", file=sys.stderr)
+        inform(f"using the behaviour agent trained here: {ladder.folder}")
         _warn_other_recipe(ladder, recipe)
     warn_other_physics(f"the behaviour agent of {recipe.name}", ladder.info.get("versions", {}), recipe.env_spec())
     return ladder
@@ -154,10 +154,9 @@ def _warn_other_recipe(ladder: Ladder, recipe: Recipe) -> None:
     used, wanted = ladder.info.get("sac"), json.loads(json.dumps(dataclasses.asdict(recipe.sac)))
     changed = [key for key, value in wanted.items() if isinstance(used, dict) and used.get(key, value) != value]
     if changed:
-        print(
-            f"offbench: warning: that agent was trained with other [sac] settings than the recipe's "
-            f"({', '.join(changed)}); delete {ladder.folder.parent} to train it again",
-            file=sys.stderr,
+        warn(
+            f"that agent was trained with other [sac] settings than the recipe's "
+            f"({', '.join(changed)}); delete {ladder.folder.parent} to train it again"
         )
 
 

@@ -10,7 +10,6 @@ resets them with the segment's seeds and plays the recorded actions again, which
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -23,6 +22,7 @@ from offbench.common import checkpoints
 from offbench.common.arrays import Array
 from offbench.common.checkpoints import keep_newest, load_checkpoint, save_checkpoint
 from offbench.common.files import JsonObject, disk_errors
+from offbench.common.terminal import warn
 
 OPTIMIZERS = ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer")
 
@@ -87,10 +87,9 @@ def restore(folder: TrainingFolder, model: SAC, start_segment: Callable[[int], N
         if step % segment:
             start_segment(step)
             if not _replay_segment(model, {name: tensors[f"transitions.{name}"].numpy() for name in TRANSITIONS}):
-                print(
-                    f"offbench: warning: the environment did not repeat the episodes before step {step:,} exactly "
-                    "(is it deterministic? another MuJoCo?); resuming from an earlier checkpoint",
-                    file=sys.stderr,
+                warn(
+                    f"the environment did not repeat the episodes before step {step:,} exactly "
+                    "(is it deterministic? another MuJoCo?); resuming from an earlier checkpoint"
                 )
                 continue
             _restore_generators(model, tensors["generator"], state["generators"])

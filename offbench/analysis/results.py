@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 import re
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase as fnmatch
@@ -23,6 +22,7 @@ from offbench.analysis.methods import Method, find_method, method_order, name_me
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.scores import LAST, Evaluations, mean_std, normalize, run_return, window
+from offbench.common.terminal import warn
 from offbench.common.text import counted, printable
 from offbench.data.levels import LEVELS
 from offbench.training.run import DIGITS, Run, RunConfig, find_runs
@@ -288,7 +288,7 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
     if damaged and not groups:
         raise damaged[0]
     for reason in damaged:
-        print(f"offbench: warning: left out: {printable(str(reason))}", file=sys.stderr)
+        warn(f"left out: {printable(str(reason))}")
     tasks = _tasks(groups)
     configs: dict[tuple[str, str], list[RunConfig]] = {}
     for (_, _, algorithm, variant), group in groups.items():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import sys
 from pathlib import Path
 
 import torch
@@ -15,6 +14,7 @@ from safetensors.torch import save
 from offbench.common.arrays import content_sha256
 from offbench.common.errors import DamagedError
 from offbench.common.files import JsonObject, damage, regular, write_bytes
+from offbench.common.terminal import inform
 
 KEPT = 2
 _NAME = re.compile(r"checkpoint-(\d{9,})\.safetensors")
@@ -55,7 +55,7 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], J
                 raise ValueError("its SHA-256 does not match its content")
             return tensors, state
     except (DamagedError, FileNotFoundError) as error:
-        print(f"offbench: {error}", file=sys.stderr)
+        inform(str(error))
         return None
 
 

@@ -55,6 +55,16 @@ def labeled(label: str, text: str, style: str) -> None:
         print(f"{label}: {text}", file=sys.stderr, flush=True)
 
 
+def inform(text: str) -> None:
+    """Print `offbench: text` to stderr."""
+    print(f"offbench: {text}", file=sys.stderr, flush=True)
+
+
+def warn(text: str) -> None:
+    """Print `offbench: warning: text` to stderr."""
+    inform(f"warning: {text}")
+
+
 def hint(*words: str) -> None:
     """Print the command to run next to stderr, quoted so that it can be pasted."""
     labeled("next", shlex.join(words), "bold green")

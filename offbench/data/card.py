@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import csv
 import shlex
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from offbench.common.files import JsonObject, read_json, write_bytes, write_json
 from offbench.common.provenance import versions
 from offbench.common.scores import normalize
 from offbench.common.tables import markdown
+from offbench.common.terminal import warn
 from offbench.data import minari_store
 from offbench.data.levels import LEVELS, full_size
 from offbench.data.show import Summary, show
@@ -61,7 +61,7 @@ def card(env: str, out: str | Path | None = None, behaviour_dir: str | Path = BE
     facts = {level: _facts(recipe, summary) for level, summary in levels.items()}
     means = [facts[level]["return"] for level in LEVELS]
     if sorted(means) != means:
-        print(f"offbench: warning: the levels of {recipe.name} are out of order: {means}", file=sys.stderr)
+        warn(f"the levels of {recipe.name} are out of order: {means}")
     folder = Path(out or f"{recipe.name}-card")
     made = {name: versions()[name] for name in DECIDE}
     _keep_hashes(recipe, facts, made["mujoco"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import itertools
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from offbench.common.files import JsonObject, sha256
 from offbench.common.processes import default_workers
 from offbench.common.progress import Progress
 from offbench.common.provenance import versions
+from offbench.common.terminal import inform
 from offbench.data import minari_store
 from offbench.data.behaviour_policy import BehaviourPolicy, level_name, read_behaviour_policy
 from offbench.data.card import compare
@@ -109,7 +109,7 @@ def collect(
     prepared = prepare(ladder) if trained else None
     if prepared and not overwrite and minari_store.exists(dataset_id) and _is(dataset_id, prepared[-1]):
         minari_store.tidy(dataset_id)
-        print(f"offbench: {dataset_id} is recorded already, from the same policies and seed", file=sys.stderr)
+        inform(f"{dataset_id} is recorded already, from the same policies and seed")
         return dataset_id
     with minari_store.claimed(dataset_id, overwrite) as path:
         if prepared is None:
@@ -122,7 +122,7 @@ def collect(
             episodes = _counted(itertools.chain.from_iterable(streams), progress)
             content = minari_store.write(path, episodes, recording.spec, metadata, total, recording.spaces)
     if seed == 0 and steps is None and not retrain and (said := compare(recipe, name, content)):
-        print(f"offbench: {said}", file=sys.stderr)
+        inform(said)
     if ladder:
         warn_other_references(recipe, ladder)
     return dataset_id
@@ -141,9 +141,7 @@ def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:
     from offbench.agents.behaviour import behaviour
 
     recipe.env_spec()  # refuses a bad environment before the training is announced
-    print(
-        f"offbench: {recipe.name} has no behaviour agent in {behaviour_dir} yet; training one first", file=sys.stderr
-    )
+    inform(f"{recipe.name} has no behaviour agent in {behaviour_dir} yet; training one first")
     return behaviour(recipe, behaviour_dir=behaviour_dir, workers=workers)
 
 
@@ -227,10 +225,9 @@ class _Recording:
                 f"{self.recipe.name} has no policy within {NEAR} of {fraction:g} of the expert's return; the nearest: "
                 f"{near}; use such a fraction, or `offbench collect --accept` to record the nearest"
             )
-        print(
-            f"offbench: the policy nearest {fraction:g} is the one of step {rung.step:,}: return {rung.ret:.0f}, "
-            f"{where:.2f} of the expert's",
-            file=sys.stderr,
+        inform(
+            f"the policy nearest {fraction:g} is the one of step {rung.step:,}: return {rung.ret:.0f}, "
+            f"{where:.2f} of the expert's"
         )
         return rung
 
@@ -243,10 +240,7 @@ class _Recording:
         if not low <= fraction <= high and not accept:
             raise OffbenchError(f"{said}, far from {MEDIUM:.2f}; `offbench collect --accept` records it anyway")
         remedy = "" if self.recipe.folder else "; a shorter [sac] segment in the recipe keeps more policies"
-        print(
-            f"offbench: {said}: no policy of the training is at {MEDIUM:.2f} to {MEDIUM_AT_MOST}{remedy}",
-            file=sys.stderr,
-        )
+        inform(f"{said}: no policy of the training is at {MEDIUM:.2f} to {MEDIUM_AT_MOST}{remedy}")
 
     def policy(self, rung: Rung | None) -> Policy | FunctionPolicy:
         """Return the policy that plays a part."""

@@ -15,7 +15,6 @@ the metadata, under `offbench`. infos/ are left out.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +29,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, damage, sha256_of
 from offbench.common.progress import Progress
 from offbench.common.provenance import versions
+from offbench.common.terminal import inform, warn
 from offbench.data import minari_store
 from offbench.data.d4rl_file import NUMBERS, SEEDS, Source, read_source
 from offbench.data.minari_reader import flags
@@ -150,10 +150,9 @@ def _by_name(source: Source, recipe: Recipe) -> _Origin:
         )
     if _shapes(spec) == source.shapes:
         return _Origin(recorded, spec, recipe)
-    print(
-        f"offbench: warning: {source.path.name} is of {name}, which has {_words(shapes)}, and {recipe.env_id} has "
-        f"{_words(_shapes(spec))}: policies are not evaluated",
-        file=sys.stderr,
+    warn(
+        f"{source.path.name} is of {name}, which has {_words(shapes)}, and {recipe.env_id} has "
+        f"{_words(_shapes(spec))}: policies are not evaluated"
     )
     return _Origin(recorded, None, recipe)
 
@@ -200,17 +199,13 @@ def _ends(source: Source, origin: _Origin) -> dict[int, tuple[bool, bool]]:
                     timeouts[begin + limit - 1 : last + 1 : limit] = True
                     begin = last + 1
         if resets:
-            print(
-                f"offbench: {source.path} has {resets:,} resets within what its flags call one episode; cut there",
-                file=sys.stderr,
-            )
+            inform(f"{source.path} has {resets:,} resets within what its flags call one episode; cut there")
     stops[-1] = True
     unflagged = int((stops & ~terminals & ~timeouts)[:-1].sum())
     if complete and 2 * unflagged > count:
-        print(
-            f"offbench: warning: {source.path}: the next_observations of {unflagged:,} of {count:,} rows are not the "
-            "observations of the next row, so each is the end of an episode (rounded numbers, or shuffled rows?)",
-            file=sys.stderr,
+        warn(
+            f"{source.path}: the next_observations of {unflagged:,} of {count:,} rows are not the "
+            "observations of the next row, so each is the end of an episode (rounded numbers, or shuffled rows?)"
         )
     last_rows = np.flatnonzero(stops | timeouts)
     return {int(i): (bool(terminals[i]), bool(timeouts[i] or not terminals[i])) for i in last_rows}
@@ -239,10 +234,9 @@ def _starts(source: Source, origin: _Origin) -> Array:
     """
     starts = np.zeros(len(source) + 1, bool)
     if origin.evaluated is None:
-        print(
-            f"offbench: warning: {source.path} has no timeouts, and without its environment an episode that begins "
-            "before the time limit of the last one cannot be told: each is one false transition",
-            file=sys.stderr,
+        warn(
+            f"{source.path} has no timeouts, and without its environment an episode that begins "
+            "before the time limit of the last one cannot be told: each is one false transition"
         )
         return starts
     env = make_env(origin.evaluated)

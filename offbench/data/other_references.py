@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 
 from offbench.agents.ladder import Ladder
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
+from offbench.common.terminal import warn
 from offbench.data import minari_store
 from offbench.envs.recipes import Recipe
 
@@ -22,11 +22,10 @@ def warn_other_references(recipe: Recipe, ladder: Ladder) -> None:
             if ours.get("env") == recipe.name and _scale(ours.get("references", {})) not in (None, wanted):
                 others.append(dataset_id)
     if others:
-        print(
-            f"offbench: warning: scores of {recipe.name} are now from {ladder.random_return:.1f} to "
+        warn(
+            f"scores of {recipe.name} are now from {ladder.random_return:.1f} to "
             f"{ladder.expert_return:.1f}; recorded with other references, so not to be compared with: "
-            f"{', '.join(others)}; record them again with --overwrite",
-            file=sys.stderr,
+            f"{', '.join(others)}; record them again with --overwrite"
         )
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
 from offbench.common.provenance import versions
+from offbench.common.terminal import inform
 from offbench.data import minari_store
 from offbench.envs import environments
 from offbench.envs.environments import Env, believed_env
@@ -103,4 +103,4 @@ def say_margin(dataset_id: str, metadata: JsonObject, spec: str) -> None:
         words += f"; its metadata do not tell, `offbench verify {dataset_id}` finds out"
     else:
         words += ", which recorded it"
-    print(f"offbench: {words}", file=sys.stderr)
+    inform(words)

@@ -15,7 +15,6 @@ import hashlib
 import json
 import os
 import shutil
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +28,7 @@ from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, disk_errors, read_text, write_json
 from offbench.common.progress import Progress
+from offbench.common.terminal import warn
 from offbench.data import minari_store
 from offbench.data.file_stamps import ReplacedError, Stamps, checked, recorded, unchanged
 from offbench.data.minari_reader import check_storage, flags, float32, open_parsed, reading
@@ -299,11 +299,10 @@ def _scaled(actions: Array, space: gym.spaces.Box, dataset_id: str) -> Array:
     scaled = 2.0 * (actions - low) / (high - low) - 1.0
     outside = int((np.abs(scaled) > 1 + CLIP_TOLERANCE).any(1).sum())
     if outside:
-        print(f"offbench: warning: {dataset_id}: {outside} actions out of bounds were clipped", file=sys.stderr)
+        warn(f"{dataset_id}: {outside} actions out of bounds were clipped")
     if 0 < (used := float((scaled.max(0) - scaled.min(0)).max()) / 2) < LEAST_USED:
-        print(
-            f"offbench: warning: {dataset_id}: actions use {used:.1g} of the range between the action space's bounds, "
-            "which policies can hardly resolve; correct the action space to what the environment takes",
-            file=sys.stderr,
+        warn(
+            f"{dataset_id}: actions use {used:.1g} of the range between the action space's bounds, "
+            "which policies can hardly resolve; correct the action space to what the environment takes"
         )
     return np.clip(scaled, -1, 1).astype(np.float32)

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import functools
 import multiprocessing
-import sys
 from collections.abc import Callable
 
 import gymnasium as gym
@@ -27,6 +26,7 @@ import mujoco
 import numpy as np
 
 from offbench.common.arrays import Array
+from offbench.common.terminal import warn
 from offbench.envs.margin_rule import ADDED, EARLIER, SINCE
 
 SUMMED_SINCE, GAP_OUTSIDE_SINCE, RK4_ROTATIONS_SINCE = (3, 5), (3, 9), (4, 0)
@@ -75,10 +75,9 @@ def has_margins(model: mujoco.MjModel) -> bool:
 def _warn_once(name: str, rule: str) -> None:
     if multiprocessing.parent_process() is None:  # a worker's parent has made the same environment
         remedy = "mujoco<3.5" if rule == EARLIER else "mujoco>=3.5"
-        print(
-            f"offbench: warning: {name}: no contact margins on MuJoCo {mujoco.__version__} give the contacts of "
-            f"versions {SINCE[rule]}, so the model keeps its own; for those, install '{remedy}'",
-            file=sys.stderr,
+        warn(
+            f"{name}: no contact margins on MuJoCo {mujoco.__version__} give the contacts of "
+            f"versions {SINCE[rule]}, so the model keeps its own; for those, install '{remedy}'"
         )
 
 

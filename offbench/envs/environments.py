@@ -13,7 +13,6 @@ import contextlib
 import importlib.util
 import json
 import multiprocessing
-import sys
 from collections.abc import Iterator
 from typing import Any, TypeAlias
 
@@ -23,6 +22,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError, drawing_variable
+from offbench.common.terminal import warn
 from offbench.envs.margin_rule import EARLIER, MARGIN, without_margin
 from offbench.envs.trust import check_code
 
@@ -82,10 +82,9 @@ def checked_spec(text: str, where: str, observation_dim: int, low: Array, high: 
             f"{shapes[0]} and {shapes[1]}: {ELSEWHERE}"
         )
     if not same_bounds(actions, low, high):
-        print(
-            f"offbench: warning: {where} has actions with bounds {_bounds(low, high)}, the environment {name} takes "
-            f"{_bounds(actions.low, actions.high)}: returns in it are not those of the data's task",
-            file=sys.stderr,
+        warn(
+            f"{where} has actions with bounds {_bounds(low, high)}, the environment {name} takes "
+            f"{_bounds(actions.low, actions.high)}: returns in it are not those of the data's task"
         )
     return text
 
@@ -148,10 +147,9 @@ def _warn_endless(name: str, spec: EnvSpec | None) -> None:
     """Warn once about an environment without a time limit, in which an episode may never end."""
     if time_limit(spec) is None and name not in _endless and multiprocessing.parent_process() is None:
         _endless.add(name)
-        print(
-            f"offbench: warning: {name} has no time limit (max_episode_steps): an episode that does not end within "
-            f"{LONGEST:,} steps is an error",
-            file=sys.stderr,
+        warn(
+            f"{name} has no time limit (max_episode_steps): an episode that does not end within "
+            f"{LONGEST:,} steps is an error"
         )
 
 
@@ -196,7 +194,7 @@ def _quiet_loading(env_id: str) -> Iterator[None]:
 
 def _say_unless_deprecated(warning: str) -> None:
     if "deprecated" not in warning:
-        print(f"offbench: warning: MuJoCo: {warning.strip()}", file=sys.stderr)
+        warn(f"MuJoCo: {warning.strip()}")
 
 
 def _ask_once(env: Env) -> None:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import sys
-
 from offbench.common.provenance import versions
+from offbench.common.terminal import warn
 
 
 def warn_other_physics(what: str, recorded: dict[str, str], spec: str) -> None:
     """Print a warning when `what` was made on a MuJoCo that moves the environment of an EnvSpec (JSON) differently."""
     made, here = recorded.get("mujoco", ""), versions()["mujoco"]
     if made and not _same_physics(made, here, spec):
-        print(
-            f"offbench: warning: {what} was made with mujoco {made}, installed is {here}: "
-            "the physics differ, scores may not compare",
-            file=sys.stderr,
-        )
+        warn(f"{what} was made with mujoco {made}, installed is {here}: the physics differ, scores may not compare")
 
 
 def _same_physics(a: str, b: str, spec: str) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 from offbench.agents.ladder import read_ladder
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
+from offbench.common.terminal import warn
 from offbench.data import minari_store
 from offbench.data.levels import LEVELS
 from offbench.envs.recipes import load_recipe, names
@@ -65,7 +65,7 @@ def _datasets() -> JsonObject:
             metadata = minari_store.read_metadata(dataset_id)
             counts = {key: int(metadata[key]) for key in ("total_steps", "total_episodes")}
         except (OffbenchError, KeyError, TypeError, ValueError):
-            print(f"offbench: warning: {dataset_id} has damaged metadata", file=sys.stderr)
+            warn(f"{dataset_id} has damaged metadata")
             continue
         full = minari_store.provenance(metadata).get("full_size")
         short = isinstance(full, int) and counts["total_steps"] < full

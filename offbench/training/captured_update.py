@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Hashable, Mapping
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 from offbench.algorithm.cpu_capture import NotCapturableError, Recording, attributes, changed_attribute, record
 from offbench.algorithm.interface import Algorithm, check_logs
 from offbench.common.errors import OffbenchError
+from offbench.common.terminal import inform
 from offbench.training.batches import Store
 
 Sums = list[tuple[str, float, int]]  # of each logged quantity: its name, its sum, and over how many updates
@@ -101,7 +101,7 @@ class Program:
         self.eager = True
         self._recordings, self._graphs = {}, {}
         name = type(self.algorithm).__name__
-        print(f"offbench: {name}.update {reason}: updates run without capture, which is slower", file=sys.stderr)
+        inform(f"{name}.update {reason}: updates run without capture, which is slower")
 
     def _warm_up(self, phase: Hashable, side: torch.cuda.Stream) -> None:
         """Do one of the first updates of a phase as it is; after a few, capture the phase for those to come."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
@@ -20,6 +19,7 @@ from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
 from offbench.common.provenance import made_with
 from offbench.common.settings import fields
+from offbench.common.terminal import inform
 from offbench.data import transitions
 from offbench.data.recorded_env import say_margin
 from offbench.data.transitions import Transitions
@@ -62,10 +62,9 @@ def check_datasets(datasets: Datasets) -> None:
                 say_margin(name, data.metadata, data.env_spec)
             warn_other_physics(name, data.metadata.get("offbench", {}).get("versions", {}), data.env_spec)
         else:
-            print(
-                f"offbench: {name} names no environment, so nothing is evaluated during training; "
-                "`offbench train --env RECIPE` names one",
-                file=sys.stderr,
+            inform(
+                f"{name} names no environment, so nothing is evaluated during training; "
+                "`offbench train --env RECIPE` names one"
             )
 
 

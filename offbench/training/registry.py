@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 
 from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, drawing_variable, unknown
 from offbench.common.files import OPEN_FILES, JsonObject
+from offbench.common.terminal import warn
 
 if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
@@ -55,7 +56,7 @@ def _entry_points() -> dict[str, list[importlib.metadata.EntryPoint]]:
         try:
             points = package.entry_points.select(group=GROUP)
         except Exception as error:  # a package whose metadata are damaged must not stop the others
-            print(f"offbench: warning: {package} has unreadable entry points ({error})", file=sys.stderr)
+            warn(f"{package} has unreadable entry points ({error})")
             continue
         for point in points:
             if point not in (same := by_name.setdefault(point.name, [])):

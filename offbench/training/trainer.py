@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
@@ -22,6 +21,7 @@ from offbench.common.interrupts import stops_noted
 from offbench.common.provenance import made_with
 from offbench.common.scores import normalize
 from offbench.common.seeds import Purpose
+from offbench.common.terminal import inform
 from offbench.data.transitions import Transitions
 from offbench.rollouts.rollouts import Outcome, Rollouts, result
 from offbench.training.loggers import Loggers
@@ -161,7 +161,7 @@ class Trainer:
             if self.stack.step and not run.policy_path.exists():  # somebody deleted it: the checkpoint has it
                 self.stack.policy(i).save(run.policy_path)
             if self.stack.step and not run.losses_path.exists():
-                print(f"offbench: {run.losses_path} is missing; it starts again at this step", file=sys.stderr)
+                inform(f"{run.losses_path} is missing; it starts again at this step")
             # an evaluation at the end of a shorter training may lie between this one's
             self.evaluations[i] = {
                 step: episodes
