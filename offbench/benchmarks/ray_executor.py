@@ -27,6 +27,7 @@ from offbench.benchmarks.datasets import record_source
 from offbench.benchmarks.grid import Source
 from offbench.common.errors import OffbenchError
 from offbench.common.files import write_bytes
+from offbench.common.processes import environment
 from offbench.data import minari_store
 from offbench.training.jobs import JobProgress, is_over, raise_first, train_job
 from offbench.training.spec import Job, RunSpec
@@ -205,21 +206,11 @@ def _shared(token: str) -> bool:
 @contextmanager
 def _own_folder() -> Iterator[Path]:
     """Yield a folder of this task alone, which Minari's datasets and the cache are in too."""
-    with tempfile.TemporaryDirectory(prefix="offbench-") as name:
-        old = {key: os.environ.get(key) for key in ("MINARI_DATASETS_PATH", "OFFBENCH_CACHE")}
-        os.environ |= {"MINARI_DATASETS_PATH": f"{name}/minari", "OFFBENCH_CACHE": f"{name}/cache"}
-        try:
-            yield Path(name)
-        finally:
-            _restore(old)
-
-
-def _restore(environment: dict[str, str | None]) -> None:
-    for key, value in environment.items():
-        if value is None:
-            os.environ.pop(key, None)
-        else:
-            os.environ[key] = value
+    with (
+        tempfile.TemporaryDirectory(prefix="offbench-") as name,
+        environment({"MINARI_DATASETS_PATH": f"{name}/minari", "OFFBENCH_CACHE": f"{name}/cache"}),
+    ):
+        yield Path(name)
 
 
 def _train(

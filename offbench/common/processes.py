@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from offbench.common.errors import OffbenchError
@@ -22,6 +22,25 @@ if TYPE_CHECKING:
 
 GRACE = 2.0  # seconds that a worker has to end when its pool closes
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@contextlib.contextmanager
+def environment(variables: Mapping[str, str | None]) -> Iterator[None]:
+    """Set environment variables within this context, also for processes started in it; None deletes a variable."""
+    before = {name: os.environ.get(name) for name in variables}
+    _set(variables)
+    try:
+        yield
+    finally:
+        _set(before)
+
+
+def _set(variables: Mapping[str, str | None]) -> None:
+    for name, value in variables.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
 
 
 def cores() -> int:
@@ -59,15 +78,12 @@ def quiet_start() -> Iterator[None]:
     """
     script = sys.modules["__main__"]
     threads = {name: "1" for name in THREADS if name not in os.environ}
-    with start_errors(), stops_delayed():
+    with start_errors(), stops_delayed(), environment(threads):
         sys.modules["__main__"] = types.ModuleType("__main__")
-        os.environ |= threads
         try:
             yield
         finally:
             sys.modules["__main__"] = script
-            for name in threads:
-                del os.environ[name]
 
 
 class _Worker:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import disk_errors, exclusive_lock
+from offbench.common.processes import environment
 from offbench.common.text import printable
 from offbench.data import minari_store
 
@@ -33,7 +32,7 @@ def download(dataset_id: str) -> None:
         aside = root / ".offbench-download"
         shutil.rmtree(aside, ignore_errors=True)  # of a download that was killed
         try:
-            with _minari_in(aside):
+            with environment({"MINARI_DATASETS_PATH": str(aside)}):
                 _fetch(dataset_id)
             with disk_errors(str(root)):
                 _move(aside, root)
@@ -55,20 +54,6 @@ def _fetch(dataset_id: str) -> None:
         reason = " ".join(printable(str(error) or type(error).__name__).split())
         remedy = "check the id (`minari list remote`) and the connection"
         raise OffbenchError(f"cannot download {dataset_id}: {reason}; {remedy}") from error
-
-
-@contextlib.contextmanager
-def _minari_in(folder: Path) -> Iterator[None]:
-    """Let Minari take another folder for that of its datasets."""
-    before = os.environ.get("MINARI_DATASETS_PATH")
-    os.environ["MINARI_DATASETS_PATH"] = str(folder)
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["MINARI_DATASETS_PATH"]
-        else:
-            os.environ["MINARI_DATASETS_PATH"] = before
 
 
 def _move(aside: Path, root: Path) -> None:

@@ -16,6 +16,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.errors import OffbenchError
+from offbench.common.processes import environment
 
 VARIABLE = "OFFBENCH_TRUST"
 REMEDY = f"if you trust where it is from, add --trust ({VARIABLE}=1 in Python)"
@@ -54,15 +55,8 @@ LONGEST = 200  # characters of a text
 @contextlib.contextmanager
 def trusting() -> Iterator[None]:
     """Let files name any environment within this context, in processes started in it too."""
-    before = os.environ.get(VARIABLE)
-    os.environ[VARIABLE] = "1"
-    try:
+    with environment({VARIABLE: "1"}):
         yield
-    finally:
-        if before is None:
-            del os.environ[VARIABLE]
-        else:
-            os.environ[VARIABLE] = before
 
 
 def is_trusting() -> bool:

@@ -9,6 +9,8 @@ import subprocess
 import sys
 from collections.abc import Iterator
 
+from offbench.common.processes import environment
+
 BACKENDS = ("egl", "osmesa")
 KEY = "MUJOCO_GL"
 TIMEOUT = 60  # seconds that a probe may take
@@ -54,14 +56,5 @@ def drawing_with(backend: str | None) -> Iterator[None]:
 
     PyOpenGL's own variable is left out: MuJoCo refuses to load if it names another renderer.
     """
-    before = {name: os.environ.get(name) for name in (KEY, "PYOPENGL_PLATFORM")}
-    if backend:
-        os.environ.pop("PYOPENGL_PLATFORM", None)
-        os.environ[KEY] = backend
-    try:
+    with environment({"PYOPENGL_PLATFORM": None, KEY: backend} if backend else {}):
         yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
