@@ -80,8 +80,8 @@ class RungEvaluator:
             if table["made"] == self._made():
                 self._earlier = {name: dict(table[name]) for name in self._earlier}
 
-    def _save(self, kind: str, step: int, value: float | dict[str, float]) -> None:
-        self._earlier[kind][str(step)] = value
+    def _save(self, table: str, step: int, value: float | dict[str, float]) -> None:
+        self._earlier[table][str(step)] = value
         write_json(self.folder.path / MEASURED, {"made": self._made(), **self._earlier})
 
     def _made(self) -> dict[str, str | int]:

@@ -176,13 +176,13 @@ class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
         return result
 
 
-def attributes(thing: object) -> dict[str, object]:
+def attributes(owner: object) -> dict[str, object]:
     """Return the attributes of an object, to be compared with a later state by `changed_attribute`.
 
     Numbers, texts and the contents of lists, dicts, sets and plain objects count by value, anything else by identity.
     What a checkpoint keeps, and tensors changed in place, do not count: a replay changes them too.
     """
-    return {name: _state(value, frozenset()) for name, value in vars(thing).items()}
+    return {name: _state(value, frozenset()) for name, value in vars(owner).items()}
 
 
 def changed_attribute(before: dict[str, object], after: dict[str, object], *, first: bool) -> str | None:
@@ -250,10 +250,8 @@ _OUT: dict[OpOverload, Variant | None] = {}  # the variant that writes in place,
 def _in_place(func: OpOverload, args: Args, kwargs: Kwargs, result: Tensor | Sequence[Tensor | None]) -> Call:
     """Return the call that does the same and writes into `result`."""
     outputs = [result] if isinstance(result, Tensor) else list(result)
-    tensors = [
-        output for output in outputs if isinstance(output, Tensor)
-    ]  # a backward pass has None where nobody asks
-    whole = len(tensors) == len(outputs)
+    tensors = [output for output in outputs if isinstance(output, Tensor)]
+    whole = len(tensors) == len(outputs)  # a backward pass has None for gradients that are not needed
     if whole and func not in _OUT:
         _OUT[func] = next((v for v in _variants(func, len(tensors)) if _agrees(v, args, kwargs, tensors)), None)
     variant = _OUT[func] if whole else None

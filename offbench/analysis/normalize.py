@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import shlex
 from collections.abc import Collection, Iterable, Sequence
@@ -17,7 +15,7 @@ from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import Entry, entries_of, read_results
 from offbench.analysis.statistics import iqm
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject
+from offbench.common.files import JsonObject, csv_bytes
 from offbench.common.scores import normalize
 from offbench.common.tables import latex, markdown
 from offbench.common.text import aligned, compact, no_formula
@@ -149,11 +147,7 @@ TITLES: dict[str, str | None] = {
     "d4rl_score": "score (D4RL ref.)",
     "d4rl_score_std": None,
 }
-NARROW: dict[str, str | None] = {
-    "score": "score",
-    "d4rl_score": "D4RL score",
-    "evaluations": "evals",
-}  # titles on a terminal
+NARROW: dict[str, str | None] = {"score": "score", "d4rl_score": "D4RL score", "evaluations": "evals"}  # on a terminal
 NAMES = ("dataset", "content", "method", "environment")  # columns of text
 
 
@@ -162,10 +156,8 @@ def render(rows: Sequence[Row], style: str = "table") -> str:
     if style == "json":
         return json.dumps(list(rows), indent=1)
     if style == "csv":
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerows([list(rows[0]), *([no_formula(cell) for cell in row.values()] for row in rows)])
-        return text.getvalue().rstrip("\n")
+        values = ([no_formula(value) for value in row.values()] for row in rows)
+        return csv_bytes(list(rows[0]), values).decode().rstrip("\n")
     keys = _shown(rows)
     header = [TITLES.get(key, key) or key for key in keys]
     cells = [[_cell(row, key) for key in keys] for row in rows]
@@ -204,7 +196,7 @@ def _shown(rows: Sequence[Row]) -> list[str]:
 
 
 def _best(rows: Sequence[Row]) -> set[int]:
-    """Return the places of the rows with the highest score of their dataset, where its scores can be compared."""
+    """Return the indices of the rows with the highest score of their dataset, where its scores compare."""
     groups: dict[tuple[str | None, str | None], list[int]] = {}
     for i, row in enumerate(rows):
         groups.setdefault((row.get("dataset"), row.get("content")), []).append(i)
@@ -225,9 +217,9 @@ def notes(rows: Sequence[Row]) -> list[str]:
         if "window" in row:
             windows.setdefault((row["dataset"], row.get("content")), set()).add(row["window"])
     torn = sorted({dataset for (dataset, _), steps in windows.items() if len(steps) > 1 or None in steps})
-    lines = (
-        [f"scores of {', '.join(torn)} are of evaluations at different steps and cannot be compared"] if torn else []
-    )
+    lines = []
+    if torn:
+        lines.append(f"scores of {', '.join(torn)} are of evaluations at different steps and cannot be compared")
     if any("method" in row for row in rows):
         methods = dict.fromkeys(Method(row["algorithm"], row["variant"], None, row["method"]) for row in rows)
         lines += [f"settings of {text}" for text in unnamed_settings(methods)]

@@ -96,7 +96,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
             ["evaluate runs/hopper-medium-v0/td3_bc/default/seed-0 --episodes 100"],
         ),
         "video": Command(
-            "film a run's policy, a policy file, or a level",
+            "record a video of a run's policy, a policy file or a level",
             results.video_arguments,
             ["video hopper:medium --out hopper.gif"],
         ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from json import dumps
 
 import offbench
@@ -17,11 +18,11 @@ def doctor_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(json: bool) -> None:
-        from offbench.tools.doctor import BROKEN, OK, as_json
+        from offbench.tools.doctor import BROKEN, OK
 
         findings = offbench.doctor()
         if json:
-            print(dumps(as_json(findings), indent=1))
+            print(dumps([asdict(finding) for finding in findings], indent=1))
         else:
             rows = [[finding.name, finding.state, finding.text] for finding in findings]
             not_ok = {(i, 1) for i, finding in enumerate(findings) if finding.state != OK}

@@ -11,12 +11,7 @@ from offbench.cli.arguments import Parser, auto, completed, local_datasets, reci
 from offbench.cli.results import print_scores
 from offbench.common.terminal import hint, note
 
-SWITCHES = (
-    "--tensorboard",
-    "--trust",
-    "--fresh",
-    "--download",
-)  # flags of `train` without a value: the algorithm may follow them
+SWITCHES = ("--tensorboard", "--trust", "--fresh", "--download")  # flags of `train` that take no value
 
 
 def train_arguments(parser: Parser, words: list[str]) -> None:

@@ -57,7 +57,7 @@ def _fetch(dataset_id: str) -> None:
 
 
 def _move(aside: Path, root: Path) -> None:
-    """Move datasets and the descriptions of their namespaces to their places, what is there already left alone."""
+    """Move datasets and the descriptions of their namespaces to Minari's folder; nothing there is replaced."""
     datasets = [path.parent.parent for path in aside.glob("**/data/metadata.json")]
     for path in [*aside.glob("**/namespace_metadata.json"), *datasets]:
         inside = path.relative_to(aside)

@@ -80,7 +80,7 @@ def _card(env: str) -> Markup | None:
     if not card.exists():
         return None
     facts = read_json(card)
-    rows = [[Cell(level), *map(_fact, _facts(values))] for level, values in facts["levels"].items()]
+    rows = [[Cell(level), *_facts(values)] for level, values in facts["levels"].items()]
     header = ["level", "transitions", "episodes", "mean return", "std", "score", "terminated", "content"]
     made = ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
     shown = Table(f"card-{env}", f"{env} ({made})", header, rows)
@@ -92,17 +92,10 @@ def _card(env: str) -> Markup | None:
     return join(*parts)
 
 
-def _facts(values: JsonObject) -> list[tuple[str, float | None]]:
-    numbers: list[tuple[str, float | None]] = [
-        (f"{values[key]:,}", values[key]) for key in ("transitions", "episodes")
-    ]
-    numbers += [(f"{values[key]:,.1f}", values[key]) for key in ("return", "std", "score")]
+def _facts(values: JsonObject) -> list[Cell]:
     return [
-        *numbers,
-        (f"{100 * values['terminated']:.1f}%", values["terminated"]),
-        (next(iter(values["content_sha256"].values()))[:SHOWN], None),  # of the recording whose statistics these are
+        *(Cell(f"{values[key]:,}", values[key]) for key in ("transitions", "episodes")),
+        *(Cell(f"{values[key]:,.1f}", values[key]) for key in ("return", "std", "score")),
+        Cell(f"{100 * values['terminated']:.1f}%", values["terminated"]),
+        Cell(next(iter(values["content_sha256"].values()))[:SHOWN]),  # of the recording whose statistics these are
     ]
-
-
-def _fact(fact: tuple[str, float | None]) -> Cell:
-    return Cell(*fact)

@@ -1,4 +1,4 @@
-"""The report's figures: learning curves, final scores, IQM, performance profiles, beta and |Q| over training.
+"""Figures of results: learning curves, final scores, IQM, performance profiles, beta and |Q| over training.
 
 A figure is drawn once and kept three ways: PNG and SVG files with a legend, and an SVG for the page without one
 (the page has its own), whose ink is the page's text color so that it reads on light and dark.
@@ -92,7 +92,7 @@ def curve_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
     caption = "Mean over seeds, 95% bootstrap interval shaded."
     if any(entry.smoothed for entry in entries):
         caption += f" Each point is the mean of the last {LAST} evaluations up to it."
-    return _draw(name, caption, alt, paint, _legend(entries, looks))
+    return _draw(name, caption, alt, paint, [looks[entry.method] for entry in entries])
 
 
 def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str) -> Figure:
@@ -240,10 +240,6 @@ def shortened(text: str, most: int) -> str:
 
 def _unit(task: Task) -> str:
     return "return" if task.reference is None else f"normalized score ({REFERENCES[task.reference]})"
-
-
-def _legend(entries: Sequence[Entry], looks: Mapping[Method, Line]) -> list[Line]:
-    return [looks[entry.method] for entry in entries]
 
 
 def _draw(

@@ -45,7 +45,7 @@ def page(title: str, lead: Markup, sections: Sequence[Section], boxes: Sequence[
     links = [tag("a", section.title, href=f"#{section.name}") for section in sections]
     body = [
         tag("header", tag("h1", title), lead, tag("nav", *links, aria_label="Contents")),
-        tag("main", *[_section(section) for section in sections]),
+        tag("main", *map(_section, sections)),
         *boxes,
         tag("script", Markup(script)),
     ]

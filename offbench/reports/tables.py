@@ -37,8 +37,8 @@ def is_papers_grid(results: Results) -> bool:
     """Return whether these are the BDB paper's methods, all of them, on datasets of its tables."""
     rows = [row for row in published("scores") if row["source"] == PAPER]
     methods = {method.published for method in results.methods}
-    places = {(row["env"], row["level"]) for row in rows}
-    return methods >= PAPER_METHODS and all(task.env_and_level in places for task in results.tasks)
+    cells = {(row["env"], row["level"]) for row in rows}
+    return methods >= PAPER_METHODS and all(task.env_and_level in cells for task in results.tasks)
 
 
 def plus_minus(mean_and_std: tuple[float, float | None], digits: int = 1) -> str:

@@ -150,7 +150,7 @@ class Policy:
         """
         double = self._double
         if self.kind == "gaussian":
-            mean, std = self._gaussian(observations)
+            mean, std = self._gaussian(self._normalized(observations))
             return _clip(mean if noise is None else mean + std * noise, double.low, double.high).astype(np.float32)
         squashed = self._squashed(observations, noise)
         # +1 before scaling keeps both ends exact: tanh = -1 gives low, tanh = 1 gives high
@@ -160,27 +160,25 @@ class Policy:
     def _squashed(self, observations: Array, noise: Array | None) -> Array:
         if self.kind == "uniform":
             return np.zeros((len(observations), len(self.low))) if noise is None else noise
-        double = self._double
-        x = (np.asarray(observations, np.float64) - double.mean) / double.std
-        out = _forward(double.actor, x, self.activation)
+        x = self._normalized(observations)
         if self.kind == "tanh":
-            return np.asarray(np.tanh(out))
-        mean, log_std = out[:, : len(self.low)], out[:, len(self.low) :]
-        std = np.exp(_clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
+            return np.asarray(np.tanh(_forward(self._double.actor, x, self.activation)))
+        mean, std = self._gaussian(x)
         if noise is None or self.kind == "squashed_gaussian":
             return np.asarray(np.tanh(mean if noise is None else mean + std * noise))
         actions = np.tanh(mean[:, None] + std[:, None] * noise)  # [n, samples, act]
         repeated = np.broadcast_to(x[:, None], (*actions.shape[:2], x.shape[1]))
-        best = _forward(double.critic, np.concatenate([repeated, actions], -1), self.activation)[..., 0].argmax(1)
-        chosen: Array = actions[np.arange(len(actions)), best]
+        q = _forward(self._double.critic, np.concatenate([repeated, actions], -1), self.activation)[..., 0]
+        chosen: Array = actions[np.arange(len(actions)), q.argmax(1)]
         return chosen
 
-    def _gaussian(self, observations: Array) -> tuple[Array, Array]:
-        """Return mean and std [n, act] of the actions before the bounds."""
-        double = self._double
-        out = _forward(
-            double.actor, (np.asarray(observations, np.float64) - double.mean) / double.std, self.activation
-        )
+    def _normalized(self, observations: Array) -> Array:
+        normalized: Array = (np.asarray(observations, np.float64) - self._double.mean) / self._double.std
+        return normalized
+
+    def _gaussian(self, x: Array) -> tuple[Array, Array]:
+        """Return mean and std [n, act] of the actions before tanh or the bounds."""
+        out = _forward(self._double.actor, x, self.activation)
         mean, log_std = out[:, : len(self.low)], out[:, len(self.low) :]
         return mean, np.asarray(np.exp(_clip(log_std, LOG_STD_MIN, LOG_STD_MAX)))
 

@@ -69,14 +69,8 @@ class Episode:
         """Return the first `length` steps; an episode cut short is truncated, not terminated."""
         if length >= len(self):
             return self
-        return Episode(
-            self.seed,
-            self.observations[: length + 1],
-            self.actions[:length],
-            self.rewards[:length],
-            False,
-            True,
-        )
+        observations, actions, rewards = self.observations[: length + 1], self.actions[:length], self.rewards[:length]
+        return Episode(self.seed, observations, actions, rewards, False, True)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +45,7 @@ EXTRAS = {  # module: what it is for
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
+    """The result of one check.
 
     Attributes:
         state: `ok`, `note` or `broken`.
@@ -76,15 +76,10 @@ def doctor() -> list[Finding]:
     return [Finding(name, state, text) for name, check in checks.items() for state, text in _safely(check)]
 
 
-def as_json(findings: list[Finding]) -> list[dict[str, str]]:
-    """Return the findings as JSON has them."""
-    return [asdict(finding) for finding in findings]
-
-
 def _safely(check: Callable[[], Iterator[tuple[str, str]]]) -> list[tuple[str, str]]:
     try:
         return list(check())
-    except Exception as error:  # the doctor must live, whatever is ill
+    except Exception as error:  # doctor must not fail on a broken machine
         return [(BROKEN, f"{type(error).__name__}: {' '.join(str(error).split())}")]
 
 
@@ -103,7 +98,7 @@ def _machine() -> Iterator[tuple[str, str]]:
 
 def _gpu() -> Iterator[tuple[str, str]]:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a driver that is too old is told by what follows
+        warnings.simplefilter("ignore")  # of a driver that is too old: the result says so
         import torch
 
         if torch.cuda.is_available():
@@ -127,8 +122,8 @@ def _physics() -> Iterator[tuple[str, str]]:
 def replay_error(count: int) -> float:
     """Return the largest error of observations when shipped Hopper transitions are stepped once more.
 
-    An observation of Hopper is its state but for where along the track it stands, which moves nothing, and for
-    velocities beyond 10, which are clipped: those transitions are passed over.
+    Hopper's observation is its state without the position along the track, which the motion does not depend on.
+    Velocities are clipped at 10: such transitions are skipped.
 
     Raises:
         OffbenchError: the shipped data are missing or damaged.

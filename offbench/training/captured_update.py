@@ -79,7 +79,7 @@ class Program:
             else:
                 recording = record(lambda: self._update(phase))
         except NotCapturableError as error:
-            self._leave_eager(f"cannot be captured ({error})")
+            self._run_eagerly(f"cannot be captured ({error})")
             return
         changed = changed_attribute(before, attributes(self.algorithm), first=done == 1)
         reason = f"changes the attribute {changed}" if changed else ""
@@ -95,9 +95,9 @@ class Program:
                 f"`capture = False` in class {name}"
             )
         if reason:
-            self._leave_eager(reason)
+            self._run_eagerly(reason)
 
-    def _leave_eager(self, reason: str) -> None:
+    def _run_eagerly(self, reason: str) -> None:
         self.eager = True
         self._recordings, self._graphs = {}, {}
         name = type(self.algorithm).__name__
@@ -112,7 +112,7 @@ class Program:
             self._update(phase)
         torch.cuda.current_stream(self.device).wait_stream(side)
         if changed := changed_attribute(before, attributes(self.algorithm), first=done == 1):
-            self._leave_eager(f"changes the attribute {changed}")
+            self._run_eagerly(f"changes the attribute {changed}")
         elif done == WARM_UP:
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph, stream=side):  # recorded, not run
@@ -147,7 +147,7 @@ class Program:
         """Return one run's sum and count of what has been logged since `logged` was called."""
         return [(name, float(self.sums[name][run]), count) for name, count in self.counts.items()]
 
-    def go_on_logging(self, run: int, sums: Sums) -> None:
+    def resume_logging(self, run: int, sums: Sums) -> None:
         """Put `unlogged` sums back."""
         for name, total, count in sums:
             self.sums.setdefault(name, torch.zeros(len(self.store.sizes), device=self.device))[run] = total

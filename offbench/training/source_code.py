@@ -26,9 +26,7 @@ from offbench.training.registry import load_algorithm
 if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
 
-_codes: dict[
-    type, dict[str, str]
-] = {}  # of the classes that this process has imported, whatever happened to the files
+_codes: dict[type, dict[str, str]] = {}  # of the imported classes: their files may have changed since
 LEFT_OUT = {tokenize.COMMENT, tokenize.NL, tokenize.ENCODING, tokenize.ENDMARKER}
 
 

@@ -166,9 +166,7 @@ class Training:
             What went wrong, a line each.
         """
         jobs = [replace(job, deadline=deadline, cost=(cost or {}).get(job.first.algorithm, 1.0)) for job in self.jobs]
-        jobs.sort(
-            key=lambda job: job.work, reverse=True
-        )  # a long one that starts last would run beside idle processes
+        jobs.sort(key=lambda job: -job.work)  # a long job that starts last would leave other processes idle
         local = any(is_local(job.first.algorithm) for job in jobs)  # other processes cannot import the class
         return execute(jobs, 1 if local else self.machine.processes) if jobs else []
 

@@ -59,10 +59,7 @@ class Trainer:
         self.note = ""
         self.diverged: dict[int, str] = {}  # runs that have diverged, and what to tell the user
         self.stops: list[int] = []  # Ctrl-C and SIGTERM, as they came
-        self._saved, self._save_seconds = (
-            time.monotonic(),
-            0.0,
-        )  # when the last checkpoint was written, how long it took
+        self._saved, self._save_seconds = time.monotonic(), 0.0  # when the last checkpoint was written, and how fast
 
     def train(self, report: Report) -> list[str]:
         """Train from the newest step that all runs have a checkpoint of, to the last one or the deadline.
@@ -154,7 +151,7 @@ class Trainer:
             if all(loaded):
                 for i, (tensors, state) in enumerate(checkpoint for checkpoint in loaded if checkpoint):
                     self.stack.load(i, tensors)
-                    self.stack.program.go_on_logging(i, state.get("unlogged", []))
+                    self.stack.program.resume_logging(i, state.get("unlogged", []))
                 self.stack.step = step
                 break
         for i, run in enumerate(self.runs):
