@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import shlex
 import sys
 import textwrap
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 NARROW, NARROWEST = 28, 12  # widths of a column of names
+GLUE = "\0"  # stands for a space that is no place to break a line
 
 
 def is_terminal(stream: TextIO | None) -> bool:
@@ -45,34 +47,44 @@ def say(line: str, style: str = "", *, stream: TextIO | None = None) -> None:
         print(line, file=stream, flush=True)
 
 
-def labeled(label: str, text: str, style: str) -> None:
-    """Print `label: text` to stderr, the label styled on a terminal."""
+def labeled(label: str, text: str, style: str, *, wrap: bool = True) -> None:
+    """Print `label: text` to stderr. On a terminal the label is styled, and lines end between words (with `wrap`)."""
     if is_terminal(sys.stderr):
         from rich.text import Text
 
-        console(sys.stderr).print(Text.assemble((f"{label}:", style), " ", printable(text)), soft_wrap=True)
+        screen = console(sys.stderr)
+        message = printable(f"{label}: {text}")
+        message = _wrapped(message, screen.width) if wrap else message
+        screen.print(Text.assemble((f"{label}:", style), message[len(label) + 1 :]), soft_wrap=True)
     else:
         print(f"{label}: {text}", file=sys.stderr, flush=True)
 
 
-def inform(text: str) -> None:
-    """Print `offbench: text` to stderr."""
-    print(f"offbench: {text}", file=sys.stderr, flush=True)
-
-
-def warn(text: str) -> None:
-    """Print `offbench: warning: text` to stderr."""
-    inform(f"warning: {text}")
-
-
 def hint(*words: str) -> None:
     """Print the command to run next to stderr, quoted so that it can be pasted."""
-    labeled("next", shlex.join(words), "bold green")
+    labeled("next", shlex.join(words), "bold green", wrap=False)
 
 
 def note(text: str) -> None:
     """Print something worth knowing to stderr."""
     labeled("note", text, "bold cyan")
+
+
+def inform(text: str) -> None:
+    """Print `offbench: text` to stderr."""
+    labeled("offbench", text, "bold cyan")
+
+
+def warn(text: str) -> None:
+    """Print `offbench: warning: text` to stderr."""
+    labeled("offbench: warning", text, "bold yellow")
+
+
+def _wrapped(text: str, width: int) -> str:
+    """Return text with lines of at most `width` characters. A `command` stays on one line, for a paste."""
+    glued = re.sub("`[^`]*`", lambda command: command[0].replace(" ", GLUE), text)
+    lines = textwrap.wrap(glued, width, break_long_words=False, break_on_hyphens=False)
+    return "\n".join(lines).replace(GLUE, " ")
 
 
 def print_table(

@@ -72,6 +72,20 @@ def test_the_table_of_runs_fits(screen: Callable[..., str], home: Path, columns:
     assert plain.count("finished") == 4 * 6 * 2
 
 
+@pytest.mark.parametrize("columns", [60, 80])
+def test_a_message_breaks_between_words_and_not_within_a_command(screen: Callable[..., str], columns: int) -> None:
+    words = ["normalize", "--runs", "a-folder-without-runs"]
+    text = screen(columns, *words)
+    assert "\x1b[1;31moffbench:\x1b[0m no evaluated runs" in text
+    lines = COLOR.sub("", text).splitlines()
+    assert max(map(len, lines)) <= columns
+    command = "`offbench train ALGO --dataset ID`"
+    assert any(command in line for line in lines)
+    message = f"offbench: no evaluated runs below a-folder-without-runs; start one with {command}"
+    assert " ".join(lines) == message
+    assert len(message) > columns
+
+
 def test_no_color_where_it_is_not_wanted(screen: Callable[..., str], home: Path) -> None:
     for words in (["--help"], ["train", "--help"], ["list"], ["show", "nothing-v0"]):
         assert COLOR.search(screen(80, *words)), words
