@@ -10,8 +10,10 @@ TD3+BC (td3_bc.py) whose constraint is shared by beta between cloning and a GAN 
 D is updated just before the actor, its actions pi(s) detached; it works on logits, -log D = softplus(-logit). With
 beta = 0 every number is TD3+BC's, bit for bit. Critics start in agreement, so Unc < 1 and the adaptive beta is
 near 1 at first: by the published rule the discriminator alone constrains the policy until Q has grown.
-Deviations: lambda is TD3+BC's, by mean |Q_1(s, pi(s))|, as in the authors' code that the paper builds on (its eq. 12
-has the data's actions). The paper leaves open whether beta is per sample or per batch (`beta_scope`).
+Deviation: lambda is TD3+BC's, by mean |Q_1(s, pi(s))|, as in the authors' code that the paper builds on (its eq. 12
+has the data's actions). The paper leaves open, and here is: beta per sample (or per batch, `beta_scope`); the Q values
+of Algorithm 2 those of M critics at one action, two by default, and not of their targets; cloning's square a mean over
+the action's dimensions, as in TD3+BC; D's observations normalized as all others.
 """
 
 from __future__ import annotations

@@ -11,9 +11,10 @@ actor's support is held within the data's, which a variational autoencoder (VAE)
     multiplier raised where MMD > threshold, lowered where it is below:  loss = -multiplier (MMD - threshold)
 
 Noise of the samples in MMD is clipped to +-0.5, as in the authors' code. Acts with the best of `eval_samples` samples
-by Q1. Deviations: no variance of the ensemble in the actor's loss and no bootstrap masks (the readme turns them off);
-the multiplier starts at 1 (theirs at exp of a normal number); log std is clamped to [-20, 2] (theirs is not); a softer
-clamp of the VAE's log std at 2 (theirs 15).
+by Q1. Deviations: no standard deviation of the ensemble in the actor's loss and no bootstrap masks (the authors'
+readme and script turn them off); the multiplier starts at 1 (theirs at exp of a normal number); log std is clamped to
+[-20, 2] (theirs is not), the VAE's to [-4, 2] (theirs to [-4, 15]); one kernel for all environments, the readme's
+second choice (its example for hopper has the first: laplacian, width 10).
 """
 
 from __future__ import annotations

@@ -9,7 +9,8 @@ Reference: the authors' code, github.com/ikostrikov/implicit_q_learning. No acti
 in this order, each with what the ones before it have just learned; the critics' targets Q' follow at the end. The
 policy is a Gaussian around tanh(mean) whose std is one learned number an action, and acts with its mean.
 Deviations: rewards are taken as they are (the authors scale MuJoCo's by 1000 / (best - worst return); `reward_scale`
-does that); initial weights are torch.nn.Linear's, theirs are orthogonal.
+does that); initial weights are torch.nn.Linear's, theirs are orthogonal; data actions are not clipped (theirs to
++-(1 - 1e-5)).
 """
 
 from __future__ import annotations

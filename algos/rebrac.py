@@ -11,7 +11,8 @@ Squares are summed over the action's dimensions. The actor and all targets are u
 update only. The authors tuned the penalties for each dataset; the defaults are those of hopper-medium
 (halfcheetah-medium has actor_penalty 0.001). Deviations: where the data has no next action, at a truncated episode's
 end, there is no penalty on a' (the authors drop that transition); initial weights are torch.nn.Linear's (theirs have
-biases of 0.1 and a last layer near 0); targets follow the actor after its update (theirs before).
+biases of 0.1 and a last layer near 0); the actor's target follows it after its update (theirs before); the actor's
+updates are the second, fourth, ... (theirs the first, third, ...).
 """
 
 from __future__ import annotations
