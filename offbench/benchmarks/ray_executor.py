@@ -7,6 +7,9 @@
 A node that can read the driver's token on its own disk works in the driver's folders. Any other node downloads the
 datasets and checkpoints from the file server, trains in a folder of its own and uploads the run folders. A lost node
 costs what it had not uploaded: Ray runs its tasks again, and a run's bits do not depend on where it resumes.
+
+An algorithm of the user's own is sent with each task as the code that the driver imported, so that all nodes run that
+code, whatever files they have. Packages must be installed on each node.
 """
 
 from __future__ import annotations
@@ -30,6 +33,8 @@ from offbench.common.files import write_bytes
 from offbench.common.processes import environment
 from offbench.data import minari_store
 from offbench.training.jobs import JobProgress, is_over, raise_first, train_job
+from offbench.training.registry import own_algorithm, use
+from offbench.training.source_code import own_modules
 from offbench.training.spec import Job, RunSpec
 
 if TYPE_CHECKING:
@@ -92,6 +97,8 @@ class RayExecutor:
         """Train jobs, slice by slice, wherever a processor is free; return what went wrong, a line each."""
         jobs = [replace(job, specs=tuple(replace(s, folder=s.folder.resolve()) for s in job.specs)) for job in jobs]
         common = Path(os.path.commonpath([spec.folder for job in jobs for spec in job.specs]))
+        for name in {job.first.algorithm for job in jobs}:
+            self._send_code(name)
         waiting, active, problems = list(range(len(jobs))), dict["ObjectRef", int](), list[str]()
         with JobProgress(jobs) as progress, _token(common) as token:
             while waiting or active:
@@ -109,11 +116,25 @@ class RayExecutor:
                     progress.update(index, step, note)
         return problems
 
+    def _send_code(self, algorithm: str) -> None:
+        """Let Ray pickle the modules of a user's own algorithm by value, as other nodes cannot import them."""
+        from ray import cloudpickle
+
+        for module in own_modules(algorithm):
+            cloudpickle.register_pickle_by_value(module)
+        try:
+            cloudpickle.dumps(own_algorithm(algorithm))
+        except Exception as error:  # whatever its globals raise
+            raise OffbenchError(
+                f"the code of {algorithm} cannot be sent to the nodes ({error}); install it as a package on each"
+            ) from error
+
     def _start(self, job: Job, index: int, token: str) -> ObjectRef:
         gpu = {"num_gpus": 1} if job.device != "cpu" else {}
         task = self.ray.remote(**self._options, **gpu)(_train)
         rest = replace(job, specs=unfinished(job))
-        return task.remote(rest, self.slice, index, str(minari_store.root().resolve()), token, self.server)
+        own = own_algorithm(job.first.algorithm)
+        return task.remote(rest, own, self.slice, index, str(minari_store.root().resolve()), token, self.server)
 
     def _result(self, ref: ObjectRef, job: Job) -> tuple[bool, list[str]]:
         try:
@@ -214,9 +235,15 @@ def _own_folder() -> Iterator[Path]:
 
 
 def _train(
-    job: Job, seconds: float, index: int, datasets: str, token: str, server: ActorHandle
+    job: Job, own: type | None, seconds: float, index: int, datasets: str, token: str, server: ActorHandle
 ) -> tuple[bool, list[str]]:
-    """A task: train a job for a slice of time, which begins now, however long the task has waited."""
+    """A task: train a job for a slice of time, which begins now, however long the task has waited.
+
+    Args:
+        own: the algorithm's class if no package has it.
+    """
+    if own is not None:
+        use(own)
     slice_end = time.time() + seconds
     job = replace(job, deadline=slice_end if job.deadline is None else min(job.deadline, slice_end))
 

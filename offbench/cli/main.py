@@ -12,6 +12,7 @@ from typing import Any, NoReturn, TextIO
 from offbench.cli import data, results, tools, training
 from offbench.cli.arguments import Command, Parser
 from offbench.common.errors import unknown
+from offbench.common.files import disk_errors
 from offbench.common.terminal import labeled
 from offbench.common.text import printable
 from offbench.training.registry import failure
@@ -135,6 +136,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if argv is None else argv)
     if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions
         _complete()
+    _open_closed()
+    try:
+        with contextlib.redirect_stderr(_Lossy(sys.stderr)):
+            _main(words)
+    finally:
+        _drop_unwritten()
+
+
+def _main(words: list[str]) -> None:
     try:
         with _terminable(), _printable_output():
             _run(words)
@@ -144,17 +154,14 @@ def main(argv: Sequence[str] | None = None) -> None:
         labeled("offbench", f"stopped{resume if _command(words) in RESUMED else ''}", "bold yellow")
         sys.exit(143 if isinstance(stop, Terminated) else 130)
     except BrokenPipeError:  # the reader of a pipe (`| head`) has left
-        _discard_output()
-        sys.stderr.close()
         sys.exit(0)
     except Exception as error:
-        _discard_output()
         labeled("offbench", printable(" ".join(failure(error).split())), "bold red")
         sys.exit(2)
 
 
-class _Printable:
-    """A text stream that spells out control characters of files instead of obeying them.
+class _Stream:
+    """A text stream with another `write`.
 
     Attributes:
         raw_stream: the stream itself, for text with colors of our own.
@@ -163,20 +170,49 @@ class _Printable:
     def __init__(self, stream: TextIO) -> None:
         self.raw_stream = stream
 
-    def write(self, text: str) -> int:
-        encoding = self.raw_stream.encoding or "utf-8"
-        return self.raw_stream.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
-
     def __getattr__(self, name: str) -> Any:
         return getattr(self.raw_stream, name)
+
+
+class _Printable(_Stream):
+    """Spells out control characters of files instead of obeying them."""
+
+    def write(self, text: str) -> int:
+        encoding = self.raw_stream.encoding or "utf-8"
+        with disk_errors("the output"):
+            return self.raw_stream.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
+
+    def flush(self) -> None:
+        with disk_errors("the output"):
+            self.raw_stream.flush()
+
+
+class _Lossy(_Stream):
+    """Drops what cannot be written: a training goes on although its log file is on a full disk."""
+
+    def write(self, text: str) -> int:
+        with _lost():
+            self.raw_stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with _lost():
+            self.raw_stream.flush()
+
+
+@contextlib.contextmanager
+def _lost() -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError:
+        pass
 
 
 @contextlib.contextmanager
 def _printable_output() -> Iterator[None]:
     """Print to stdout through `_Printable`, and to the end: a full disk is met here, not when Python exits."""
-    if sys.stdout is None:  # closed by the shell
-        yield
-        return
     with contextlib.redirect_stdout(_Printable(sys.stdout)):
         try:
             yield
@@ -184,13 +220,26 @@ def _printable_output() -> Iterator[None]:
             sys.stdout.flush()
 
 
-def _discard_output() -> None:
-    """Drop what stdout could not write, or Python would try again at its exit."""
-    try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _open_closed() -> None:
+    """Open the standard streams that the shell has closed (`2>&-`), or other files and pipes get their numbers."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            null = os.open(os.devnull, os.O_RDWR)
+            if null == number:
+                os.set_inheritable(null, True)
+            else:
+                os.dup2(null, number)
+                os.close(null)
+            setattr(sys, name, os.fdopen(number, "r" if name == "stdin" else "w", encoding="utf-8", closefd=False))
+
+
+def _drop_unwritten() -> None:
+    """Drop what stdout and stderr could not write, or Python would try again at its exit."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 class Terminated(KeyboardInterrupt):

@@ -28,27 +28,50 @@ LOCKED = (
     "another program has it open for writing: wait until it is closed (if this disk has no file locks, set "
     "HDF5_USE_FILE_LOCKING=FALSE)"
 )
+WRITE_REMEDIES: dict[int | None, str] = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "free some space or "),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "check its permissions or "),
+}
 DISK = "check the disk or the network that holds it, and run the command again"
+NO_MEMORY = "close other programs; if there is enough memory, it is damaged"
 READ_REMEDIES: dict[int | None, str] = {  # of errors that say nothing against a file's content
     **OPEN_FILES,
     **dict.fromkeys((errno.EAGAIN, errno.EWOULDBLOCK, errno.EDEADLK, errno.ENOLCK), LOCKED),
     **dict.fromkeys((errno.EACCES, errno.EPERM), "check its permissions"),
+    errno.ENOMEM: NO_MEMORY,
     **dict.fromkeys((errno.EIO, errno.ENXIO, errno.ENODEV, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN), DISK),
-    errno.ENOMEM: "close other programs",
 }
 SHIPPED = "reinstall offbench"  # the remedy for damage to a file that comes with offbench
 ORPHANS = 3.0  # seconds to wait for a lock: processes whose parent was killed notice it within one
 
 
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether memory has run out, of this machine or of a GPU."""
+    words = ("can't allocate memory", "out of memory", "failed to map segment")  # PyTorch's, and the dynamic linker's
+    by_number = isinstance(error, OSError) and error.errno == errno.ENOMEM
+    by_text = isinstance(error, RuntimeError | ImportError) and any(word in str(error) for word in words)
+    return isinstance(error, MemoryError) or by_number or by_text
+
+
+def is_exhausted(error: BaseException) -> bool:
+    """Return whether memory or file descriptors have run out, which says nothing against what was being done."""
+    return is_out_of_memory(error) or (isinstance(error, OSError) and error.errno in OPEN_FILES)
+
+
 @contextlib.contextmanager
-def disk_errors(what: str) -> Iterator[None]:
-    """Turn the operating system's errors (full disk, no permission) into one clear line."""
+def disk_errors(what: str, elsewhere: str = "choose another folder") -> Iterator[None]:
+    """Turn the operating system's errors (full disk, no permission) into one clear line.
+
+    Args:
+        what: the file or folder that is written.
+        elsewhere: how to choose another one.
+    """
     try:
         yield
     except OSError as error:
         if isinstance(error, FileNotFoundError | BrokenPipeError):
             raise
-        remedy = OPEN_FILES.get(error.errno, "free some space or choose another folder")
+        remedy = OPEN_FILES.get(error.errno) or f"{WRITE_REMEDIES.get(error.errno, '')}{elsewhere}"
         raise OffbenchError(f"cannot write {what}: {error.strerror or error}; {remedy}") from error
 
 
@@ -208,6 +231,8 @@ def damage(name: str, fault: str, remedy: str) -> Iterator[None]:
 
 def _read_remedy(error: BaseException) -> str | None:
     """Return what to do about a failed read that says nothing against the content, None for any other."""
+    if is_out_of_memory(error):
+        return NO_MEMORY
     if isinstance(error, ImportError):
         return f"install the package {error.name}" if error.name else "install it"
     number = getattr(error, "errno", None)

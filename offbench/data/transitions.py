@@ -25,8 +25,8 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from offbench.common.arrays import Array
-from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, disk_errors, read_text, write_json
+from offbench.common.errors import DamagedError, OffbenchError
+from offbench.common.files import JsonObject, damage, disk_errors, read_text, write_json
 from offbench.common.progress import Progress
 from offbench.common.terminal import warn
 from offbench.data import minari_store
@@ -137,7 +137,7 @@ def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     sources = {f"data/{name}": minari_store.path_of(dataset_id) / "data" / name for name in stamps}
     cached = _mapped(folder, sources)
     if cached is None:
-        with disk_errors(str(folder)):
+        with disk_errors(str(folder), "set OFFBENCH_CACHE to another folder"):
             folder.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(folder.with_name(f"{folder.name}.lock")):
                 cached = _mapped(folder, sources)  # another process may have converted it meanwhile
@@ -161,18 +161,23 @@ def _mapped(folder: Path, sources: Mapping[str, Path]) -> tuple[str, dict[str, A
     """Return the content hash and the arrays of a converted dataset.
 
     None if it is not there, is damaged, or was converted from other files than `sources` are now.
+
+    Raises:
+        OffbenchError: it cannot be read for another reason, such as its permissions.
     """
     try:
-        meta = json.loads(read_text(folder / "meta.json"))
-        paths = {**sources, **{f"{name}.npy": folder / f"{name}.npy" for name in ARRAYS}}
-        files = checked(paths, meta["files"])
-        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ARRAYS}
-    except Exception:  # damaged headers raise what NumPy's parsers happen to; the dataset itself is still there
+        with damage(str(folder), "is damaged", "it is converted again"):
+            meta = json.loads(read_text(folder / "meta.json"))
+            paths = {**sources, **{f"{name}.npy": folder / f"{name}.npy" for name in ARRAYS}}
+            files = checked(paths, meta["files"])
+            arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ARRAYS}
+            content = str(meta["content_sha256"])
+    except (FileNotFoundError, DamagedError):
         return None
     if files != meta["files"]:
         with contextlib.suppress(OffbenchError):  # on a read-only disk they are hashed each time
             write_json(folder / "meta.json", meta | {"files": files})
-    return str(meta["content_sha256"]), arrays
+    return content, arrays
 
 
 def cache() -> Path:

@@ -22,6 +22,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError, drawing_variable
+from offbench.common.files import is_exhausted
 from offbench.common.terminal import warn
 from offbench.envs.margin_rule import EARLIER, MARGIN, without_margin
 from offbench.envs.trust import check_code
@@ -47,6 +48,8 @@ def env_spec(env_id: str, **kwargs: Any) -> str:
         assert env.spec is not None
         text = env.spec.to_json()
     except Exception as error:  # a third-party environment may raise anything here
+        if is_exhausted(error):
+            raise
         hint = _remedy(error)
         if isinstance(error, gym.error.NameNotFound | gym.error.NamespaceNotFound) and ":" not in env_id:
             hint = f". If a module of yours registers it, name it before a colon: my_module:{env_id}"
@@ -120,6 +123,8 @@ def believed_env(text: str, where: str) -> Env:
     except OffbenchError as error:
         raise OffbenchError(f"{where}: {error}") from None
     except Exception as error:  # see env_spec
+        if is_exhausted(error):
+            raise
         raise OffbenchError(
             f"{where}: cannot make its environment: {reason(error).rstrip('.')}{_remedy(error)}"
         ) from error

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, drawing_variable, unknown
-from offbench.common.files import OPEN_FILES, JsonObject
+from offbench.common.files import OPEN_FILES, READ_REMEDIES, JsonObject, is_exhausted, is_out_of_memory
 from offbench.common.terminal import warn
 
 if TYPE_CHECKING:
@@ -75,17 +75,18 @@ def failure(error: Exception) -> str:
     The traceback goes to stderr if $OFFBENCH_TRACEBACK is set, or if an installed algorithm has the fault: whoever
     writes one needs it.
     """
-    expected = isinstance(error, OffbenchError | OSError) or _is_out_of_memory(error)
+    expected = isinstance(error, OffbenchError | OSError) or is_out_of_memory(error)
     algorithm = None if expected else _third_party(error.__traceback__)
     if algorithm or os.environ.get("OFFBENCH_TRACEBACK"):
         traceback.print_exception(error)
     if isinstance(error, OffbenchError):
         return str(error)
-    if _is_out_of_memory(error):
-        return f"not enough memory ({error or 'for this command'}); close other programs, or ask for less"
+    if is_out_of_memory(error):
+        return f"not enough memory ({str(error) or 'for this command'}); close other programs, or ask for less"
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        remedy = f"; {OPEN_FILES[error.errno]}" if error.errno in OPEN_FILES else ""
+        remedies = READ_REMEDIES if error.filename else OPEN_FILES
+        remedy = f"; {remedies[error.errno]}" if error.errno in remedies else ""
         return f"{where}{error.strerror or error}{remedy} ({SHOW_TRACEBACK})"
     if not algorithm and (variable := drawing_variable(error)):
         return f"MuJoCo does not load with {variable} ({type(error).__name__}: {error}); unset it or choose another"
@@ -94,11 +95,6 @@ def failure(error: Exception) -> str:
     if algorithm:
         return f"an error in {algorithm}: {what}; see the traceback above"
     return f"this is a bug in offbench: {what}; please report it; {SHOW_TRACEBACK}"
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    words = ("can't allocate memory", "out of memory")  # PyTorch's, on a CPU and on a GPU
-    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in words))
 
 
 def _third_party(trace: types.TracebackType | None) -> str | None:
@@ -136,6 +132,8 @@ def load_algorithm(name: str) -> type[Algorithm]:
     try:
         kind = point.load()
     except Exception as error:  # whatever its code raises
+        if is_exhausted(error):
+            raise
         why = f"{type(error).__name__}: {error}"
         raise OffbenchError(f"algorithm {name!r} ({point.value}) does not import: {why} ({SHOW_TRACEBACK})") from error
     return _checked(kind, f"algorithm {name!r} ({point.value})")
@@ -171,6 +169,11 @@ def use(algorithm: str | type) -> str:
     if not is_local(name):
         os.environ[OWN] = json.dumps(json.loads(os.environ.get(OWN, "{}")) | {name: value})
     return name
+
+
+def own_algorithm(name: str) -> type[Algorithm] | None:
+    """Return the class of a user's own algorithm, None for a package's."""
+    return load_algorithm(name) if name not in _entry_points() else None
 
 
 def is_local(name: str) -> bool:

@@ -4,24 +4,26 @@ A hash leaves out comments, docstrings and blank lines, which train nothing. The
 
     of offbench's own algorithms   the algorithm's file
     of a package                   all files of the package, and the version that is installed
-    of a file or a class           the file, and the files beside it that it imports
+    of a file or a class           the file, and the files in its folder that it imports
     of a script's or notebook's    the source of the class, its Config and its bases
 """
 
 from __future__ import annotations
 
 import ast
+import functools
 import importlib.metadata
 import inspect
 import io
 import sys
 import tokenize
-from collections.abc import Iterator, Mapping
+import types
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from offbench.common.files import sha256
-from offbench.training.registry import load_algorithm
+from offbench.training.registry import load_algorithm, own_algorithm
 
 if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
@@ -42,26 +44,42 @@ def code_of(algorithm: str) -> dict[str, str]:
 
 
 def _code_of(kind: type[Algorithm]) -> dict[str, str]:
-    from offbench.algorithm.interface import Algorithm  # imports PyTorch, which those who read config.json do without
-
     hashes: dict[str, str] = {}
-    for cls in kind.__mro__[: kind.__mro__.index(Algorithm)]:
+    for cls in _classes(kind):
         module = sys.modules.get(cls.__module__)
         file = Path(getattr(module, "__file__", None) or "")
         package = cls.__module__.partition(".")[0]
         if cls.__module__ == "__main__" or not file.is_file():
             hashes |= {one.__qualname__: text for one in (cls, kind.Config) if (text := _source_hash(one))}
         elif package == "offbench":
-            hashes[file.name] = _hash(file.read_text("utf-8"))
-        elif package != cls.__module__ or file.name == "__init__.py":
-            root = Path(str(sys.modules[package].__file__)).parent
-            hashes |= {
-                str(path.relative_to(root.parent)): _hash(path.read_text("utf-8")) for path in root.rglob("*.py")
-            }
+            hashes[file.name] = _hash(file)
+        elif folders := getattr(sys.modules[package], "__path__", None):  # several of a namespace package
+            for folder in map(Path, folders):
+                hashes |= {str(path.relative_to(folder.parent)): _hash(path) for path in folder.rglob("*.py")}
             hashes |= _version(package)
         else:
-            hashes |= {path.name: _hash(path.read_text("utf-8")) for path in _imported(file, {})} | _version(package)
+            files = _installed_with(package, file.parent) or _imported(file, file.parent, {})
+            hashes |= {str(path.relative_to(file.parent)): _hash(path) for path in {file: None, **files}}
+            hashes |= _version(package)
     return dict(sorted(hashes.items()))
+
+
+def _classes(kind: type[Algorithm]) -> Sequence[type]:
+    """Return an algorithm's class and its bases below `Algorithm`."""
+    from offbench.algorithm.interface import Algorithm  # imports PyTorch, which those who read config.json do without
+
+    return kind.__mro__[: kind.__mro__.index(Algorithm)]
+
+
+def own_modules(algorithm: str) -> list[types.ModuleType]:
+    """Return the modules of a user's own algorithm that no package brings: its file's, and those beside it."""
+    kind = own_algorithm(algorithm)
+    files: dict[Path, None] = {}
+    for cls in _classes(kind) if kind else ():
+        file = Path(getattr(sys.modules.get(cls.__module__), "__file__", None) or "")
+        if "." not in cls.__module__ and file.is_file() and not _version(cls.__module__):
+            _imported(file, file.parent, files)
+    return [one for one in list(sys.modules.values()) if Path(getattr(one, "__file__", None) or "") in files]
 
 
 def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
@@ -80,36 +98,70 @@ def _how(before: str | None, now: str | None) -> str:
     return f"was {before}, is {now}" if len(now) < 64 else "has changed"
 
 
-def _version(package: str) -> dict[str, str]:
-    """Return the version of the package that a module was installed with, if it was."""
-    names = importlib.metadata.packages_distributions().get(package, [])
-    return {f"version of {name}": importlib.metadata.version(name) for name in names}
+@functools.cache
+def _distributions() -> Mapping[str, list[str]]:
+    """Return the names of the installed packages that bring each top-level module."""
+    return importlib.metadata.packages_distributions()
+
+
+def _version(module: str) -> dict[str, str]:
+    """Return the version of the package that a top-level module was installed with, if it was."""
+    return {f"version of {name}": importlib.metadata.version(name) for name in _distributions().get(module, [])}
+
+
+def _installed_with(module: str, folder: Path) -> dict[Path, None]:
+    """Return the Python files in `folder` of the package that a module without a folder of its own comes from."""
+    distributions = [importlib.metadata.distribution(name) for name in _distributions().get(module, [])]
+    paths = [Path(str(one.locate_file(file))) for one in distributions for file in one.files or ()]
+    return {path: None for path in paths if path.suffix == ".py" and folder in path.parents and path.is_file()}
 
 
 def _source_hash(cls: type) -> str:
     try:
-        return _hash(inspect.cleandoc("\n" + inspect.getsource(cls)))
+        return _source(inspect.cleandoc("\n" + inspect.getsource(cls)))
     except (OSError, TypeError, SyntaxError):
         return ""
 
 
-def _imported(file: Path, seen: dict[Path, None]) -> dict[Path, None]:
-    """Return a file and the files of its folder that it imports, and those that these import."""
+def _imported(file: Path, root: Path, seen: dict[Path, None]) -> dict[Path, None]:
+    """Return a file and the files below `root` that it imports, and those that these import.
+
+    Args:
+        root: the folder of the algorithm's file, from which Python imports.
+    """
     if file in seen or not file.is_file():
         return seen
     seen[file] = None
-    for node in ast.walk(ast.parse(file.read_text("utf-8"))):
-        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-        names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
-        for name in names:
-            path = file.parent.joinpath(*name.split("."))
-            for candidate in (path.with_suffix(".py"), path / "__init__.py"):
-                _imported(candidate, seen)
+    for node in ast.walk(ast.parse(_text(file))):
+        modules: list[Path] = []
+        if isinstance(node, ast.Import):
+            modules = [root.joinpath(*alias.name.split(".")) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            start = file.parents[node.level - 1] if node.level else root
+            module = start.joinpath(*(node.module or "").split("."))
+            modules = [module, *(module / alias.name for alias in node.names)]
+        for path in modules:
+            _imported(path.with_name(f"{path.name}.py"), root, seen)
+            for folder in (path, *path.parents):
+                if root in folder.parents:  # a package, whose __init__.py is run too
+                    _imported(folder / "__init__.py", root, seen)
     return seen
 
 
-def _hash(source: str) -> str:
-    return sha256("\n".join(_tokens(source)).encode())
+def _text(file: Path) -> str:
+    with tokenize.open(file) as opened:  # in the encoding that the file declares
+        return opened.read()
+
+
+def _hash(file: Path) -> str:
+    try:
+        return _source(_text(file))
+    except (SyntaxError, UnicodeDecodeError):  # a template, say: a file of a package that is never imported
+        return sha256(file.read_bytes())
+
+
+def _source(text: str) -> str:
+    return sha256("\n".join(_tokens(text)).encode())
 
 
 def _tokens(source: str) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -123,6 +124,64 @@ def test_nodes_that_share_no_disk_fetch_and_bring_back(
     monkeypatch.setattr(ray_executor, "_token", foreign)
     assert run("ray", ray_executor.RayExecutor(nodes.address, slice_seconds=2))
     same(home, "local", "ray")
+
+
+OWN_GRID = """
+seeds = 2
+eval_every = 500
+eval_episodes = 2
+datasets = [{id = "mine-v0", env = "inverted-pendulum", level = "medium", steps = 1_000}]
+
+[[algorithms]]
+name = "./mine/algo.py:Mine"
+steps = 3_000
+hidden = [32, 32]
+"""
+ALGO = """
+import losses
+from parts.half import HALF
+from offbench.algos.bc import BC
+
+class Mine(BC):
+    def update(self, batch, noise, phase):
+        return losses.checked(super().update(batch, noise, phase), HALF)
+"""
+LOSSES = """
+def checked(logs, half):
+    return {name: half * value for name, value in logs.items()}
+"""
+
+
+def test_an_algorithm_of_ones_own_is_sent_to_the_nodes(
+    two_nodes: Any, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the files beside it; all files are gone before the tasks start, so that no node can read them."""
+    import shutil
+
+    nodes, _ = two_nodes
+    (home / "grid.toml").write_text(OWN_GRID)
+    (home / "mine" / "parts").mkdir(parents=True)
+    (home / "mine" / "parts" / "half.py").write_text("HALF = 0.5\n")
+    (home / "mine" / "algo.py").write_text(ALGO)
+    (home / "mine" / "losses.py").write_text(LOSSES)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert run("local", None)
+    executor = ray_executor.RayExecutor(nodes.address, slice_seconds=2)
+    send = executor._send_code
+
+    def and_hide(name: str) -> None:
+        send(name)
+        (home / "mine").rename(home / "elsewhere")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(executor, "_send_code", and_hide)
+        assert run("ray", executor)
+    same(home, "local", "ray")
+    shutil.rmtree(home / "ray")
+    (home / "elsewhere").rename(home / "mine")
+    monkeypatch.setattr(sys.modules["losses"], "checked", lambda *_: 1 / 0)
+    with pytest.raises(OffbenchError, match="ZeroDivisionError"):
+        run("ray", ray_executor.RayExecutor(nodes.address))
 
 
 def test_what_fails_on_a_node_is_said_here(two_nodes: Any, home: Path) -> None:

@@ -18,9 +18,10 @@ from offbench import collect
 from offbench.analysis import normalize
 from offbench.cli.main import main
 from offbench.common import files
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.settings import setting
 from offbench.common.text import no_formula, printable
+from offbench.data import transitions
 from offbench.training import registry
 from offbench.training.run import Run, find_runs
 from offbench.training.spec import variant
@@ -204,15 +205,42 @@ def test_a_full_disk_behind_stdout_is_one_line() -> None:
     found = offbench("list", before="exec >/dev/full;")
     assert found.returncode == 2
     assert len(found.stderr.splitlines()) == 1
-    assert "No space left" in found.stderr
+    assert "cannot write the output: No space left" in found.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("streams", ["2>/dev/full", "2>&-", "<&- >&- 2>&-"])
+def test_a_log_that_cannot_be_written_stops_nothing(streams: str, home: Path) -> None:
+    """Worker processes are started here too, which pass on the numbers of their streams."""
+    words = ["collect", "inverted-pendulum", "--level", "random", "--steps", "300", "--workers", "2"]
+    assert offbench(*words, before=f"exec {streams};").returncode == 0
+    assert offbench("show", "inverted-pendulum-random-v0").returncode == 0
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="`ulimit -n` of other systems begins elsewhere")
-def test_few_file_descriptors_are_one_line() -> None:
-    found = offbench("collect", "inverted-pendulum", "--level", "random", "--steps", "300", before="ulimit -n 14;")
+def test_few_file_descriptors_are_one_line_and_leave_nothing(home: Path) -> None:
+    words = ["collect", "inverted-pendulum", "--level", "random", "--steps", "300", "--workers", "2"]
+    found = offbench(*words, before="ulimit -n 14;")
     assert found.returncode == 2
     assert len(found.stderr.splitlines()) == 1, found.stderr
     assert "ulimit -n" in found.stderr
+    assert not [path for path in (home / "minari").iterdir() if path.suffix != ".lock"]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="`ulimit -n` of other systems begins elsewhere")
+def test_few_file_descriptors_do_not_make_a_cache_or_an_environment_faulty(home: Path) -> None:
+    dataset = collect("inverted-pendulum", "random", steps=300, workers=1)
+    transitions.load(dataset)
+    before = {path: path.stat().st_mtime_ns for path in (home / "cache").rglob("*.npy")}
+    for limit in (8, 12):
+        found = offbench(
+            "train", "td3_bc", "--dataset", dataset, "--hidden", "8", "--steps", "2", before=f"ulimit -n {limit};"
+        )
+        assert found.returncode == 2
+        assert len(found.stderr.splitlines()) == 1, found.stderr
+        assert "ulimit -n" in found.stderr
+        assert not any(word in found.stderr for word in ("converting", "delete", "--env"))
+    assert before == {path: path.stat().st_mtime_ns for path in (home / "cache").rglob("*.npy")}
 
 
 def test_full_shared_memory_is_one_line() -> None:
@@ -239,6 +267,8 @@ def test_odd_terminals_get_what_they_can_show() -> None:
         (MemoryError("Unable to allocate 8 EiB"), "not enough memory (Unable to allocate 8 EiB)"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried ..."), "not enough memory (Default"),
         (RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"), "not enough memory (CUDA"),
+        (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "not enough memory (libtorch"),
+        (MemoryError(), "not enough memory (for this command)"),
         (RuntimeError("size mismatch"), "bug in offbench"),
         (OSError(24, "Too many open files", "a.csv"), "ulimit -n"),
         (ZeroDivisionError("by zero"), "bug in offbench"),
@@ -293,6 +323,19 @@ def test_an_error_in_an_installed_algorithm_keeps_its_traceback(
 
 
 def test_damage_brings_no_error_of_a_parser_out() -> None:
-    for error in (MemoryError(), RecursionError(), KeyError("x"), StopIteration(), AssertionError("odd")):
-        with pytest.raises(OffbenchError, match="delete it"), files.damage("a.bin", "is damaged", "delete it"):
+    for error in (RecursionError(), KeyError("x"), StopIteration(), AssertionError("odd")):
+        with pytest.raises(DamagedError, match="delete it"), files.damage("a.bin", "is damaged", "delete it"):
             raise error
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError("8 EiB"), RuntimeError("can't allocate memory"), OSError(12, "No memory")]
+)
+def test_no_memory_is_no_damage(error: Exception) -> None:
+    """An absurd size in a damaged file may ask for it, but so does a sound file beside other programs."""
+    with (
+        pytest.raises(OffbenchError, match="close other programs") as raised,
+        files.damage("a.bin", "is bad", "delete"),
+    ):
+        raise error
+    assert not isinstance(raised.value, DamagedError)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import shutil
@@ -186,6 +187,49 @@ def test_an_edit_of_an_imported_neighbor_is_noticed(home: Path) -> None:
     (home / "losses.py").write_text("WEIGHT = 50\n")
     assert changes(before, code_of(registry.use("awac.py"))) == "losses.py has changed"
     assert changes({}, code_of(registry.use("awac.py"))) == ""  # a run of an earlier version
+
+
+LAYOUTS = {  # how the file imports a neighbor, and the neighbor
+    "import parts.losses": "parts/losses.py",
+    "from parts import losses": "parts/losses.py",
+    "from parts.losses import WEIGHT": "parts/losses.py",
+    "import parts": "parts/__init__.py",
+    "from parts.relative import WEIGHT": "parts/losses.py",
+    "from parts.absolute import WEIGHT": "parts/losses.py",
+    "from losses import WEIGHT  # of a folder beside it, of the same name as another file": "losses.py",
+}
+
+
+@pytest.mark.parametrize("line", LAYOUTS)
+def test_an_edit_is_noticed_however_a_neighbor_is_imported(line: str, home: Path) -> None:
+    (home / "parts").mkdir()
+    for name in ("losses.py", "parts/losses.py", "parts/__init__.py"):
+        (home / name).write_text("WEIGHT = 1\n")
+    (home / "parts" / "relative.py").write_text("from . import losses\nWEIGHT = losses.WEIGHT\n")
+    (home / "parts" / "absolute.py").write_text("from parts.losses import WEIGHT\n")
+    (home / "my_algo.py").write_text(f"import torch\n{line}\nfrom offbench.algos.bc import BC\nclass Mine(BC): pass\n")
+    before = code_of(registry.use("my_algo.py"))
+    assert before.keys() <= {"bc.py", "my_algo.py", "losses.py", *(f"parts/{p.name}" for p in home.glob("parts/*.py"))}
+    again(home)
+    (home / LAYOUTS[line]).write_text("WEIGHT = 2\n")
+    assert changes(before, code_of(registry.use("my_algo.py"))) == f"{LAYOUTS[line]} has changed"
+
+
+def test_files_of_a_package_that_are_no_python_of_today_are_hashed_all_the_same(home: Path) -> None:
+    """A package without __init__.py, with a template and a file in another encoding."""
+    (home / "space").mkdir()
+    (home / "space" / "algo.py").write_text("from offbench.algos.bc import BC\nclass Mine(BC): pass\n")
+    (home / "space" / "template.py").write_text("print 'hello {{ name }}'\n")
+    (home / "space" / "latin.py").write_bytes("# -*- coding: latin-1 -*-\nNAME = 'é'\n".encode("latin-1"))
+    (home / "unrelated.py").write_text("")
+    sys.path.insert(0, str(home))
+    algorithm = importlib.import_module("space.algo").Mine
+    files = {"bc.py", "space/algo.py", "space/template.py", "space/latin.py"}
+    before = code_of(registry.use(algorithm))
+    assert set(before) == files
+    source_code._codes.clear()
+    (home / "space" / "template.py").write_text("print 'goodbye {{ name }}'\n")
+    assert changes(before, code_of(registry.use(algorithm))) == "space/template.py has changed"
 
 
 def test_an_edit_of_a_package_and_another_version_are_noticed(home: Path) -> None:
