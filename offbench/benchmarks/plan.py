@@ -124,13 +124,15 @@ class Plan:
         env_spec = next(iter(env_specs.values()))  # for the shapes, which differ little
         play = float(np.mean([step_seconds(text) for text in env_specs.values()]))
         self._seconds = self._disk = self._products = 0.0
-        for specs in filter(None, left):
-            yield self._variant(specs, env_spec, play)
+        to_train = [specs for specs in left if specs]
+        widths = max(len(_name(specs[0])) for specs in to_train), max(len(f"{specs[0].steps:,}") for specs in to_train)
+        for specs in to_train:
+            yield self._variant(specs, env_spec, play, *widths)
         if missing := bench.missing():
             yield self._recording(missing, env_spec, play)
         yield from self._total()
 
-    def _variant(self, specs: Sequence[RunSpec], env_spec: str, play: float) -> str:
+    def _variant(self, specs: Sequence[RunSpec], env_spec: str, play: float, name_width: int, width: int) -> str:
         spec, machine, runs = specs[0], self.bench.machine, len(specs)
         rate = measure(spec, env_spec, machine.device)
         each = _cost(spec, rate, play, env_spec)
@@ -141,8 +143,8 @@ class Plan:
         if machine.device == "cpu":
             self._products += runs * spec.steps * operations(spec, env_spec)
         return (
-            f"  {_name(spec):<40}{runs:>4} runs x {spec.steps:>9,} updates, "
-            f"{rate.updates:>8,.0f} a second: {duration(cost)}"
+            f"  {_name(spec):<{name_width}}{runs:>4} runs x {spec.steps:>{width},} updates "
+            f"at {rate.updates:>5,.0f}/s: {duration(cost)}"
         )
 
     def _recording(self, missing: Sequence[Source], spec: str, play: float) -> str:

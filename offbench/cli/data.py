@@ -8,7 +8,7 @@ from typing import Any
 
 import offbench
 from offbench.cli.arguments import Parser, completed, levels, local_datasets, natural, recipes, trust, whole
-from offbench.common.terminal import hint, print_table, say
+from offbench.common.terminal import hint, print_lines, print_table, say
 
 
 def collect_arguments(parser: Parser, _: list[str]) -> None:
@@ -113,7 +113,7 @@ def show_arguments(parser: Parser, _: list[str]) -> None:
     def run(dataset_id: str, plot: str | None) -> None:
         summary = offbench.show(dataset_id)
         picture = summary.plot(plot) if plot else None
-        print("\n".join(summary.lines()))
+        print_lines(summary.lines())
         if picture:
             print(f"saved {picture}", file=sys.stderr)
 
@@ -159,7 +159,10 @@ def verify_arguments(parser: Parser, _: list[str]) -> None:
 
     def run(as_json: bool, **arguments: Any) -> None:
         report = offbench.verify(**arguments)
-        print(report.to_json() if as_json else "\n".join(report.lines()))
+        if as_json:
+            print(report.to_json())
+        else:
+            print_lines(report.lines())
         if not report.ok:
             sys.exit(1)
 

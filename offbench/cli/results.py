@@ -9,7 +9,7 @@ from typing import Any
 import offbench
 from offbench.cli.arguments import Parser, completed, local_datasets, methods, natural, number, recipes, trust, whole
 from offbench.common.files import JsonObject
-from offbench.common.terminal import is_terminal, note, print_table, say
+from offbench.common.terminal import is_terminal, note, print_lines, print_table, say
 from offbench.common.text import counted
 
 RUNS_HELP = "folder of the runs (default: runs)"
@@ -87,7 +87,10 @@ def compare_arguments(parser: Parser, _: list[str]) -> None:
 
     def run(json: bool, **arguments: Any) -> None:
         comparison = offbench.compare(**arguments)
-        print(dumps(comparison.row(), indent=1) if json else "\n".join(comparison.lines()))
+        if json:
+            print(dumps(comparison.row(), indent=1))
+        else:
+            print_lines(comparison.lines())
 
     parser.set_defaults(run=run)
 
@@ -124,7 +127,7 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
             if similarity:
                 _similar(path, arguments["seed"], algorithm, tolerance, action_tolerance)
             else:
-                print("\n".join(([path] if len(paths) > 1 else []) + offbench.evaluate(path, **arguments).lines()))
+                print_lines(offbench.evaluate(path, **arguments).lines())
 
     parser.set_defaults(run=run)
 

@@ -9,7 +9,7 @@ import offbench
 from offbench.cli.algorithm_flags import add_settings, moved_flag, notices
 from offbench.cli.arguments import Parser, auto, completed, local_datasets, recipes, seed_list, share, trust, whole
 from offbench.cli.results import print_scores
-from offbench.common.terminal import hint, note
+from offbench.common.terminal import hint, note, print_lines
 
 SWITCHES = ("--tensorboard", "--trust", "--fresh", "--download")  # flags of `train` that take no value
 
@@ -141,7 +141,7 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
         from offbench.benchmarks.plan import Plan, prepare
 
         if plan:
-            print("\n".join(Plan(prepare(**arguments))))
+            print_lines(Plan(prepare(**arguments)))
             return
         command = shlex.join(["offbench", "benchmark", *words])
         where = None
@@ -151,7 +151,9 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
             where = RayExecutor(address)
             arguments["workers"] = arguments["workers"] or where.cpus
         bench = prepare(**arguments)
-        finished = offbench.benchmark(bench, budget=budget, shard=shard, executor=where, command=command)
+        finished = offbench.benchmark(
+            bench, budget=budget, shard=shard, executor=where, say=lambda line: print_lines([line]), command=command
+        )
         if rows := normalize.score_some(bench.started()):  # a small budget ends before there are any
             print_scores(rows)
         runs = [] if arguments["runs"] == "runs" else ["--runs", arguments["runs"]]

@@ -11,7 +11,7 @@ import re
 import shlex
 import sys
 import textwrap
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, TextIO
 
 from offbench.common.text import aligned, printable
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 NARROW, NARROWEST = 28, 12  # widths of a column of names
+LABEL = re.compile(r" *([A-Za-z][\w -]*?  +|\w+_\w+ )(?=\S)")  # at the start of a line
 GLUE = "\0"  # stands for a space that is no place to break a line
 
 
@@ -85,6 +86,31 @@ def _wrapped(text: str, width: int) -> str:
     glued = re.sub("`[^`]*`", lambda command: command[0].replace(" ", GLUE), text)
     lines = textwrap.wrap(glued, width, break_long_words=False, break_on_hyphens=False)
     return "\n".join(lines).replace(GLUE, " ")
+
+
+def print_lines(lines: Iterable[str], stream: TextIO | None = None) -> None:
+    """Print lines of text to stdout (or another stream), such as `return      mean 1197.1, std 355.1`.
+
+    On a terminal, labels are in color, and the rest of a long line stands below its text.
+    """
+    stream = stream or sys.stdout
+    if not is_terminal(stream):
+        for line in lines:
+            print(line, file=stream, flush=True)
+        return
+    from rich.text import Text
+
+    screen = console(stream)
+    for line in map(printable, lines):
+        label = LABEL.match(line)
+        indent = label.end() if label else len(line) - len(line.lstrip()) + 2
+        below = " " * indent
+        text = Text("\n".join(textwrap.wrap(line, screen.width, subsequent_indent=below, break_on_hyphens=False)))
+        if label:
+            text.stylize("cyan", 0, label.end())
+        elif line.isalpha():
+            text.stylize("bold")
+        screen.print(text, soft_wrap=True)
 
 
 def print_table(

@@ -33,25 +33,25 @@ class Summary:
         low, high = meta.get("ref_min_score"), meta.get("ref_max_score")
         lines = [
             f"{self.dataset_id}: {meta.get('description', 'no description')}",
-            f"spaces       observations {space(meta, 'observation_space')}, actions {space(meta, 'action_space')}",
-            f"episodes     {len(self.returns):,}, {int(self.lengths.sum()):,} transitions, "
+            f"spaces          observations {space(meta, 'observation_space')}, actions {space(meta, 'action_space')}",
+            f"episodes        {len(self.returns):,}, {int(self.lengths.sum()):,} transitions, "
             f"length {self.lengths.mean():.0f} ({self.lengths.min()} to {self.lengths.max()}), "
             f"{100 * self.terminated:.0f}% terminated",
-            f"return       mean {self.returns.mean():.1f}, std {self.returns.std():.1f}, "
+            f"return          mean {self.returns.mean():.1f}, std {self.returns.std():.1f}, "
             f"{self.returns.min():.1f} to {self.returns.max():.1f}",
         ]
         if low is not None and high is not None and high > low:
             score = normalize(float(self.returns.mean()), float(low), float(high))
-            lines.append(f"references   random {low:.1f}, expert {high:.1f}: normalized mean return {score:.1f}")
+            lines.append(f"references      random {low:.1f}, expert {high:.1f}: normalized mean return {score:.1f}")
         lines += ["", *_histogram(self.returns), ""]
         lines.append("provenance")
         for part in ours.get("parts", []):
-            lines += ["  part", *(f"    {key:<15} {fact(value)}" for key, value in part.items())]
+            lines += ["part", *(f"  {key:<13} {fact(value)}" for key, value in part.items())]
         told = {name: ours.get(name) for name in ("env", "level", "seed", "content_sha256", "recipe_sha256")}
         told["imported from"] = ours.get("imported", {}).get("file")
-        told |= {f"{name} version": version for name, version in ours.get("versions", {}).items()}
-        shown = [f"  {key:<17} {fact(value)}" for key, value in told.items() if value is not None]
-        return lines + (shown or ["  not recorded by offbench"])
+        told["versions"] = ", ".join(f"{name} {version}" for name, version in ours.get("versions", {}).items()) or None
+        shown = [f"{key:<15} {fact(value)}" for key, value in told.items() if value is not None]
+        return lines + (shown or ["not recorded by offbench"])
 
     def __repr__(self) -> str:
         """Return what a person types to see more."""

@@ -86,6 +86,21 @@ def test_a_message_breaks_between_words_and_not_within_a_command(screen: Callabl
     assert len(message) > columns
 
 
+@pytest.mark.parametrize("columns", [60, 80])
+def test_what_is_in_a_dataset_fits(
+    screen: Callable[..., str], medium: str, columns: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["show", medium])  # it also converts the dataset
+    plain = capsys.readouterr().out
+    text = screen(columns, "show", medium)
+    assert "\x1b[36mreturn          \x1b[0mmean" in text
+    lines = COLOR.sub("", text).splitlines()
+    assert max(map(len, lines)) <= columns
+    assert "".join(plain.split()) == "".join("".join(lines).split())
+    first = next(i for i, line in enumerate(lines) if line.startswith("versions"))
+    assert lines[first + 1].startswith(16 * " ")  # below the text, not below the label
+
+
 def test_no_color_where_it_is_not_wanted(screen: Callable[..., str], home: Path) -> None:
     for words in (["--help"], ["train", "--help"], ["list"], ["show", "nothing-v0"]):
         assert COLOR.search(screen(80, *words)), words

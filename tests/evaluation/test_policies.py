@@ -107,6 +107,6 @@ def test_what_python_shows_of_an_object_is_short(medium: str) -> None:
     assert repr(offbench.show(medium)).startswith("Summary(tiny-medium-v0, ")
     lines = offbench.show(medium).lines()
     place = lines.index("provenance")
-    assert any(line.startswith("    fraction ") for line in lines[place:])
-    assert f"  content_sha256    {data.content}" in lines
+    assert any(line.startswith("  fraction ") for line in lines[place:])
+    assert f"content_sha256  {data.content}" in lines
     assert not any("{" in line for line in lines)
