@@ -20,11 +20,12 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
-# More of what is random in the tests of faults: kills in all, and spoiled files for each reader.
+# More of what is random in the tests of faults: kills in all, and spoiled files for each reader. Each run tries others,
+# so that many short runs (KILLS=100 FUZZ=10000) are as good as a long one.
 KILLS ?= 1000
 FUZZ ?= 100000
 nightly: $(STAMP)
-	OFFBENCH_KILLS=$(KILLS) OFFBENCH_FUZZ=$(FUZZ) $(BIN)/python -m pytest -n auto --dist worksteal \
+	OFFBENCH_KILLS=$(KILLS) OFFBENCH_FUZZ=$(FUZZ) $(BIN)/python -m pytest -v -n auto --dist worksteal \
 		tests/faults/test_kill.py tests/faults/test_fuzz.py -k "kill_9 or many"
 
 # MuJoCo versions that the tests replay shipped transitions on, each in a folder of its own.

@@ -28,8 +28,10 @@ from offbench.training.run import Run, find_runs
 from tests.conftest import ROOT
 
 KILLS = {"collect": 60, "overwrite": 40, "import": 20, "train": 100}  # at least 200 over collect and train
-if total := int(os.environ.get("OFFBENCH_KILLS", "0")):  # as many in all
-    KILLS = {kind: -(-total * count // sum(KILLS.values())) for kind, count in KILLS.items()}
+NEW = int(os.environ.get("OFFBENCH_KILLS", "0"))  # as many in all, at other moments every time
+if NEW:
+    KILLS = {kind: -(-NEW * count // sum(KILLS.values())) for kind, count in KILLS.items()}
+PARTS = {kind: max(1, count // 50) if NEW else 1 for kind, count in KILLS.items()}  # a test each, for `make nightly`
 RUN = ["--steps", "160", "--eval-every", "40", "--eval-episodes", "1", "--hidden", "16,16", "--batch-size", "16"]
 
 
@@ -88,20 +90,29 @@ def facts(name: str) -> dict[str, Any]:
 
 
 Check = Callable[[Path], object]
+Record = Callable[[str, object], None]
 
 
 def trials(
-    warm: Warm, words: list[str], kind: str, home: Path, patch: pytest.MonkeyPatch, prepare: Check, look: Check
+    warm: Warm,
+    words: list[str],
+    kind: str,
+    home: Path,
+    patch: pytest.MonkeyPatch,
+    prepare: Check,
+    look: Check,
+    record_property: Record,
 ) -> None:
     """Kill a command at moments spread over its whole duration until it was killed often enough.
 
     For each trial: `prepare` its folder (datasets and cache are below it), run and kill, `look` at what is there.
     """
-    rng = np.random.default_rng(len(kind))
+    rng = np.random.default_rng(None if NEW else len(kind))
+    wanted = -(-KILLS[kind] // PARTS[kind])
     kills, trial, seconds = 0, 0, 0.0
-    while kills < KILLS[kind]:
+    while kills < wanted:
         trial += 1
-        assert trial < 4 * KILLS[kind] + 10, "the command is too short to be killed"
+        assert trial < 4 * wanted + 10, "the command is too short to be killed"
         folder = home / f"{kind}-{trial}"
         folder.mkdir()
         patch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
@@ -115,13 +126,21 @@ def trials(
             kills += warm.run(words, folder, rng.uniform(0, seconds))["status"] == -9
         look(folder)
         shutil.rmtree(folder)
-    print(f"{kind}: {kills} kills in {trial} trials of up to {seconds:.2f} s")
+    record_property("kills", kills)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["collect", "overwrite"])
+@pytest.mark.parametrize(
+    ("kind", "part"), [(kind, i) for kind in ("collect", "overwrite") for i in range(PARTS[kind])]
+)
 def test_collect_survives_kill_9(
-    kind: str, tiny: tuple[str, str], home: Path, warm: Warm, monkeypatch: pytest.MonkeyPatch
+    kind: str,
+    part: int,
+    tiny: tuple[str, str],
+    home: Path,
+    warm: Warm,
+    monkeypatch: pytest.MonkeyPatch,
+    record_property: Record,
 ) -> None:
     """A new id is absent or whole; one that is replaced is the old dataset or the new one. Then it is the new one."""
     words = ["collect", tiny[0], "--behaviour-dir", tiny[1], "--workers", "1", "--steps", "600"]
@@ -149,11 +168,14 @@ def test_collect_survives_kill_9(
         assert facts(name) == known
         assert [p.name for p in minari_store.root().iterdir() if not p.name.endswith(".lock")] == [name]
 
-    trials(warm, again if kind == "overwrite" else words, kind, home, monkeypatch, prepare, look)
+    trials(warm, again if kind == "overwrite" else words, kind, home, monkeypatch, prepare, look, record_property)
 
 
 @pytest.mark.slow
-def test_import_survives_kill_9(medium: str, home: Path, warm: Warm, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("part", range(PARTS["import"]))
+def test_import_survives_kill_9(
+    part: int, medium: str, home: Path, warm: Warm, monkeypatch: pytest.MonkeyPatch, record_property: Record
+) -> None:
     file, right = export(medium, home / "out.hdf5"), whole(medium)
     words = ["import-d4rl", str(file), "--id", "back-v0"]
 
@@ -164,12 +186,13 @@ def test_import_survives_kill_9(medium: str, home: Path, warm: Warm, monkeypatch
         assert answer["status"] == 0 or (seen and "exists already" in answer["stderr"])
         assert whole("back-v0") == right
 
-    trials(warm, words, "import", home, monkeypatch, lambda _: None, look)
+    trials(warm, words, "import", home, monkeypatch, lambda _: None, look, record_property)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("part", range(PARTS["train"]))
 def test_training_survives_kill_9_at_any_moment(
-    medium: str, home: Path, warm: Warm, monkeypatch: pytest.MonkeyPatch
+    part: int, medium: str, home: Path, warm: Warm, monkeypatch: pytest.MonkeyPatch, record_property: Record
 ) -> None:
     """Killed, then left alone: every file that counts has the undisturbed run's bytes."""
     words = ["train", "td3_bc", "--dataset", medium, *RUN]
@@ -195,8 +218,8 @@ def test_training_survives_kill_9_at_any_moment(
         assert {name: (run.folder / name).read_bytes() for name in names} == wanted
         assert run.config().dataset_sha256 == right.config().dataset_sha256
 
-    trials(warm, words, "train", home, monkeypatch, prepare, look)
-    assert KILLS["train"] < 100 or {0, 40, 80} <= set(last)  # killed early and late
+    trials(warm, words, "train", home, monkeypatch, prepare, look, record_property)
+    assert KILLS["train"] < 50 or {0, 40, 80} <= set(last)  # killed early and late
 
 
 def sound(run: Run) -> int:
