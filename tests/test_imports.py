@@ -94,7 +94,22 @@ def test_no_module_is_longer_than_400_lines() -> None:
     assert not long
 
 
-@pytest.mark.parametrize("words", [["list"], ["normalize", "--env", "hopper", "1000"], ["collect", "--help"]])
+@pytest.mark.parametrize("words", [["--help"], ["list", "--help"], ["collect", "--help"], ["train", "--help"]])
+def test_help_loads_nothing_heavy(words: list[str], home: Path) -> None:
+    code = f"""
+import sys
+from offbench.cli.main import main
+try:
+    main({words!r})
+except SystemExit as done:
+    assert done.code in (0, None), done.code
+heavy = {{"torch", "numpy", "gymnasium", "minari", "mujoco", "h5py", "matplotlib", "rich"}} & sys.modules.keys()
+assert not heavy, heavy
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=home)
+
+
+@pytest.mark.parametrize("words", [["list"], ["normalize", "--env", "hopper", "1000"]])
 def test_light_commands_do_not_load_pytorch(words: list[str], home: Path) -> None:
     code = f"""
 import sys
