@@ -159,6 +159,26 @@ def test_the_parser_of_blocks_reads_notes_titles_and_contents(tmp_path: Path) ->
     assert (two.reason, three.title) == ("needs a GPU", "f.toml")
 
 
+def test_the_readmes_first_screen_is_true() -> None:
+    """The badges agree with pyproject.toml, and before the first heading are install, three commands, one picture."""
+    text = (ROOT / "README.md").read_text()
+    first = text.partition("\n## ")[0]
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project = settings["project"]
+    versions = [name.rpartition(" ")[2] for name in project["classifiers"] if "Python ::" in name]
+    badges = re.findall(r"https://img\.shields\.io/badge/(\S+)-\w+\)", first)
+    assert badges == [f"python-{versions[0]}_to_{versions[-1]}", f"license-{project['license']}", "types-mypy_strict"]
+    assert project["requires-python"] == f">={versions[0]}"
+    assert settings["tool"]["mypy"]["strict"] is True
+    install, three = [block for block in blocks(ROOT / "README.md") if block.content in first]
+    assert re.fullmatch(r"pip install (-c constraints\.txt \.) +# or: uv pip install \1\n", install.content)
+    assert [command.split()[:2] for command in commands(three)] == [
+        ["offbench", word] for word in ("collect", "train", "normalize")
+    ]
+    (picture,) = re.findall(r"!\[[^]]+\]\((docs/results/[^\s)]+)\)", first)
+    assert (ROOT / picture).read_bytes().startswith(b"\x89PNG")
+
+
 def test_citation_names_the_version_and_licence() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     citation = (ROOT / "CITATION.cff").read_text()

@@ -55,7 +55,7 @@ class Progress:
     def say(self, line: str) -> None:
         """Print a line of its own, above the bar."""
         if self._bar is not None:
-            self._bar.console.print(line, soft_wrap=True)
+            self._bar.console.print(line)
         else:
             print(line, file=sys.stderr, flush=True)
 

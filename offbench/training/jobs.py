@@ -68,7 +68,9 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
     """Adds up the jobs' steps for one progress bar."""
 
     def __init__(self, jobs: Sequence[Job]) -> None:
-        self.jobs, self.steps = jobs, dict[int, int]()
+        self.jobs, self.steps, self.notes = jobs, dict[int, int](), dict[int, str]()
+        titles = collections.Counter(job.title for job in jobs)
+        self.titles = [job.title + (f", seed {job.first.seed}" if titles[job.title] > 1 else "") for job in jobs]
         runs = sum(len(job.specs) for job in jobs)
         title = jobs[0].title if len(jobs) == 1 else f"{runs} runs"
         self.progress = Progress(sum(job.updates for job in jobs), title, work=sum(job.work for job in jobs))
@@ -84,10 +86,10 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
         It must be called for each of a job's reports.
         """
         if index not in self.steps and step:
-            self.progress.say(f"{self.jobs[index].title}: resuming from step {step:,}")
+            self.progress.say(f"{self.titles[index]}: resuming from step {step:,}")
         self.update(index, step, note)
         if note == STOPPED:
-            self.progress.say(f"{self.jobs[index].title}: stopped at step {step:,}, checkpoint saved")
+            self.progress.say(f"{self.titles[index]}: stopped at step {step:,}, checkpoint saved")
 
     def update(self, index: int, step: int, note: str) -> None:
         """Show that a job is at `step`."""
@@ -95,11 +97,13 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
             done = step * len(self.jobs[index].specs)
             self.progress.skip(done, done * self.jobs[index].cost)
         self.steps[index] = step
-        if note and len(self.jobs) > 1:
-            note = f"{self.jobs[index].title}: {note}"
+        news = "" if note == self.notes.get(index) else note
+        self.notes[index] = note
+        if news and len(self.jobs) > 1:
+            news = f"{self.titles[index]}: {news}"
         done_of = {i: step * len(self.jobs[i].specs) for i, step in self.steps.items()}
         work = sum(done * self.jobs[i].cost for i, done in done_of.items())
-        self.progress.to(sum(done_of.values()), note, work)
+        self.progress.to(sum(done_of.values()), news, work)
 
 
 def _train_here(job: Job, index: int, progress: JobProgress) -> list[str]:

@@ -166,6 +166,14 @@ def test_settings_are_grouped(capsys: pytest.CaptureFixture[str]) -> None:
     assert ours < text.index("  --beta-max ")
 
 
+def test_collect_suggests_a_training(tiny: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    recipe, behaviour_dir = tiny
+    main(["collect", recipe, "--level", "random", "--steps", "20", "--behaviour-dir", behaviour_dir, "--workers", "1"])
+    out, err = capsys.readouterr()
+    assert out == "tiny-random-v0\n"
+    assert err.splitlines()[-1] == "next: offbench train td3_bc --dataset tiny-random-v0"
+
+
 def test_the_adaptive_beta_is_explained_and_the_next_command_can_be_pasted(
     medium: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

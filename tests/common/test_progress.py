@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import re
 import time
@@ -52,6 +53,21 @@ def test_what_is_slow_is_still_to_come(clock: Clock, capsys: pytest.CaptureFixtu
         bar.report(1, 60, "")
         # 230 units in 250 s, 120 left
         assert last_line(capsys) == "3 runs: 2,060/2,100 steps, 8 steps/s, 2 min 10 s left, cql on x-v0: score 7"
+
+
+def test_trainings_side_by_side_have_a_line_for_every_evaluation(
+    clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    jobs = [job("bc", 1, 1000, 1.0), job("bc", 1, 1000, 1.0), job("td3_bc", 1, 1000, 1.0)]
+    jobs[1] = Job((dataclasses.replace(jobs[1].first, seed=7),), "cpu")
+    with JobProgress(jobs) as bar:
+        for step in range(10, 301, 10):
+            for index in range(3):
+                clock.now += 0.01
+                bar.report(index, step, f"score {index} at step {step // 100 * 100}" if step >= 100 else "")
+    notes = [line.rpartition("left, ")[2] for line in capsys.readouterr().err.splitlines() if "score" in line]
+    titles = ["bc on x-v0, seed 0", "bc on x-v0, seed 7", "td3_bc on x-v0"]
+    assert notes == [f"{titles[i]}: score {i} at step {step}" for step in (100, 200, 300) for i in range(3)]
 
 
 def test_a_terminal_shows_the_same(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import offbench
 from offbench.reports.figures import shortened
 from offbench.reports.markup import breakable, prose
-from tests.made_runs import METHODS, made_grid
+from tests.made_runs import METHODS, made_grid, made_run
 from tests.pages import HOSTILE, Page, hostile_runs
 
 
@@ -60,6 +60,14 @@ def test_tables_are_accessible(home: Path) -> None:
     assert pictures
     assert all(len(a["aria-label"] or "") > 20 for a in pictures)
     assert dict(page.elements)["html"]["lang"] == "en"
+
+
+def test_the_axis_of_a_million_updates_has_short_labels(home: Path) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50.0, steps=1_000_000)
+    offbench.report(home / "runs", home / "out")
+    svg = (home / "out" / "figures" / "curves-hopper-medium-v0.svg").read_text()
+    labels = re.findall(r">([\d.,]+[kM]?)</text>", svg)
+    assert labels[:4] == ["250k", "500k", "750k", "1M"]
 
 
 def test_long_text_breaks_but_never_within_a_number() -> None:
