@@ -185,7 +185,7 @@ def test_the_step_that_runs_resume_from_is_printed(
     said = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)  # a terminal's control codes
     lines = said.replace("\r", "\n").splitlines()
     assert lines[0] == "already finished: 1 of 3 runs"
-    assert [line for line in lines if "resuming" in line] == [f"td3_bc on {medium}: resuming from step 100"]
+    assert [line for line in lines if "resuming" in line] == [f"td3_bc on {medium}, seed 1: resuming from step 100"]
 
 
 @pytest.mark.parametrize(("words", "goes_on"), [(["train", "bc"], True), (["show", "x-v0"], False)])
