@@ -7,6 +7,7 @@ A figure is drawn once and kept three ways: PNG and SVG files with a legend, and
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -238,6 +239,11 @@ def shortened(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most - most // 2 - 1) :]}"
 
 
+def _tick(value: float) -> str:
+    """Return the label of a place on the horizontal axis: `300k` for whole numbers, `22.5` for others."""
+    return compact(round(value)) if abs(value) >= 10 and math.isclose(value, round(value)) else f"{value:g}"
+
+
 def _unit(task: Task) -> str:
     return "return" if task.reference is None else f"normalized score ({REFERENCES[task.reference]})"
 
@@ -265,7 +271,7 @@ def _draw(
         axes.patch.set_alpha(0)
         paint(axes)
         axes.ticklabel_format(axis="x", style="plain", useOffset=False)
-        axes.xaxis.set_major_formatter(lambda value, _: compact(round(value)) if abs(value) >= 10 else f"{value:g}")
+        axes.xaxis.set_major_formatter(lambda value, _: _tick(value))
         axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
         inline = _saved(fig, "svg").decode()
         fig.patch.set_alpha(1)

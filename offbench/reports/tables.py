@@ -236,7 +236,7 @@ def iqm_table(results: Results, iqms: Mapping[Method, tuple[Estimate, Scores]]) 
         f"task (Agarwal et al. 2021). {FEW_SEEDS}",
     ]
     if len({tuple(scores) for _, scores in iqms.values()}) > 1:
-        notes.append("The methods were not run on the same tasks: their IQMs do not compare one with another.")
+        notes.append("The methods were not run on the same tasks, so their IQMs cannot be compared.")
     if not all(results.comparable(task) for task in results.tasks):
         notes.append(
             "On some tasks the scores are of evaluations at different steps (the table of scores says which): the "

@@ -92,6 +92,9 @@ def test_seven_methods_fit_a_laptop(browser: Any, home: Path) -> None:
     frames = "[...document.querySelectorAll('main .wide')].filter(frame => frame.scrollWidth > frame.clientWidth + 1)"
     assert page.evaluate("document.querySelectorAll('#scores thead th').length") == 9
     assert page.evaluate(f"{frames}.map(frame => frame.ariaLabel)") == []
+    edges = "[...document.querySelectorAll('#finals figure')].map(f => f.getBoundingClientRect().right)"
+    table = "document.querySelector('#scores .wide').getBoundingClientRect().right"
+    assert max(page.evaluate(edges)) == pytest.approx(page.evaluate(table), abs=1)  # figures use the page's width
 
 
 def test_tables_fit_on_a_printed_page(browser: Any, home: Path) -> None:

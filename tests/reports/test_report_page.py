@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import offbench
-from offbench.reports.figures import shortened
+from offbench.reports.figures import _tick, shortened
 from offbench.reports.markup import breakable, prose
 from tests.made_runs import METHODS, made_grid, made_run
 from tests.pages import HOSTILE, Page, hostile_runs
@@ -68,6 +68,7 @@ def test_the_axis_of_a_million_updates_has_short_labels(home: Path) -> None:
     svg = (home / "out" / "figures" / "curves-hopper-medium-v0.svg").read_text()
     labels = re.findall(r">([\d.,]+[kM]?)</text>", svg)
     assert labels[:4] == ["250k", "500k", "750k", "1M"]
+    assert [_tick(value) for value in (0.0, 2.5, 19.5, 20.0, 12_500.0)] == ["0", "2.5", "19.5", "20", "12.5k"]
 
 
 def test_long_text_breaks_but_never_within_a_number() -> None:
