@@ -12,7 +12,7 @@ import os
 import re
 import socket
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -147,19 +147,34 @@ def write_bytes(path: Path, data: bytes) -> None:
     Raises:
         OffbenchError: the disk refuses, or the folder is no longer the one that this process has locked.
     """
-    check_ownership(path)
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with disk_errors(str(path)):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with open(aside, "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(aside, path)
-        except BaseException:
-            aside.unlink(missing_ok=True)
-            raise
+    write_together({path: data})
+
+
+def write_together(contents: Mapping[Path, bytes]) -> None:
+    """Replace the contents of several files, in this order once all are on the disk, or leave all as they were.
+
+    Raises:
+        OffbenchError: as `write_bytes`.
+    """
+    asides: dict[Path, Path] = {}
+    try:
+        for path, data in contents.items():
+            check_ownership(path)
+            asides[path] = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+            with disk_errors(str(path)):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with open(asides[path], "wb") as file:
+                    file.write(data)
+                    file.flush()
+                    os.fsync(file.fileno())
+        for path, aside in asides.items():
+            with disk_errors(str(path)):
+                os.replace(aside, path)
+    except BaseException:
+        for aside in asides.values():
+            with contextlib.suppress(OSError):
+                aside.unlink(missing_ok=True)
+        raise
 
 
 def remove_leftovers(folder: Path) -> None:

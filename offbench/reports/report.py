@@ -17,7 +17,7 @@ from pathlib import Path
 from offbench.analysis.methods import Method
 from offbench.analysis.results import Entry, Folders, Results, read_results
 from offbench.common.errors import OffbenchError
-from offbench.common.files import write_bytes
+from offbench.common.files import write_together
 from offbench.common.tables import Table, files
 from offbench.common.text import counted, plural
 from offbench.reports import figures as draw
@@ -68,12 +68,11 @@ def report(
     written = {f"tables/{one.name}.{end}": data for one in by_name.values() for end, data in files(one).items()}
     for figure in (figure for group in pictures.values() for figure in group):
         written |= {f"figures/{figure.name}.png": figure.png, f"figures/{figure.name}.svg": figure.svg}
-    for name, data in written.items():
-        write_bytes(folder / name, data)
+    content = page(title or TITLE, _lead(results), list(_sections(results, by_name, pictures)), boxes(results))
+    written[PAGE] = content  # last: a page's links all lead somewhere
+    write_together({folder / name: data for name, data in written.items()})
     for path in before - {folder / name for name in written}:
         path.unlink(missing_ok=True)
-    content = page(title or TITLE, _lead(results), list(_sections(results, by_name, pictures)), boxes(results))
-    write_bytes(folder / PAGE, content)  # last: a page's links all lead somewhere
     return folder / PAGE
 
 

@@ -19,6 +19,7 @@ from offbench.data.export import export
 from offbench.training.run import Run
 from tests.cli.test_bad_input import refusal
 from tests.faults.test_kill import facts, whole
+from tests.made_runs import made_run
 
 SMALL = ["--steps", "40", "--eval-every", "20", "--eval-episodes", "1", "--hidden", "8,8", "--batch-size", "8"]
 
@@ -175,6 +176,25 @@ def test_a_file_that_cannot_grow(
     assert {path.read_text() for path in home.glob("out.*")} == {"old"}
     assert not list(home.glob(".out*"))
     assert [p.name for p in minari_store.root().iterdir() if not p.name.endswith(".lock")] == [name]
+
+
+def test_a_report_is_replaced_whole_or_not_at_all(home: Path) -> None:
+    """The page is the largest file: the tables and figures fit on the disk, and it does not."""
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    page = offbench.report("runs", "report", title="old")
+    before = state(home)
+    assert any(name.endswith("scores.csv") for name in before)
+    made_run(home / "runs", "hopper-medium-v0", "bc", "default", 0, 20)
+    restore = limited(page.stat().st_size - 1000)
+    try:
+        with pytest.raises(offbench.OffbenchError, match=r"cannot write report/index.html: File too large"):
+            offbench.report("runs", "report", title="new")
+    finally:
+        restore()
+    assert {name: data for name, data in state(home).items() if name.startswith("report")} == {
+        name: data for name, data in before.items() if name.startswith("report")
+    }
+    assert not list((home / "report").rglob(".*"))
 
 
 def test_every_write_in_turn(medium: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
