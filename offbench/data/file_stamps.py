@@ -28,7 +28,7 @@ def unchanged(dataset_id: str) -> Iterator[Stamps]:
     words = f"{dataset_id} was replaced while it was read; wait until it is recorded, and run the command again"
     try:
         yield before
-    except (OffbenchError, OSError) as error:
+    except Exception as error:  # Minari raises a ValueError for a missing folder, for example
         if dataset_stamps(dataset_id) == before:
             raise
         raise ReplacedError(words) from error

@@ -292,6 +292,10 @@ def write(
             if path.exists():
                 path.replace(_old(path))
             aside.replace(path)
+        except Exception as error:  # Minari raises a ValueError for a missing folder, for example
+            if aside.exists():
+                raise
+            raise OffbenchError(f"{aside} was moved or deleted while it was written; run the command again") from error
         finally:
             _recover(path)
     return content.hexdigest()

@@ -17,10 +17,12 @@ import numpy as np
 import pytest
 
 import offbench
+from offbench.cli.main import main
 from offbench.common import files
-from offbench.data import file_stamps, transitions
+from offbench.data import file_stamps, minari_store, transitions
 from offbench.data.minari_reader import episodes_of, open_minari
 from offbench.rollouts.policy import uniform
+from tests.cli.test_bad_input import refusal
 
 REWARDS = "episode_0/rewards"
 
@@ -213,6 +215,31 @@ def test_a_dataset_replaced_while_it_is_exported_or_verified(
     with pytest.raises(offbench.OffbenchError, match=f"{recorded} was replaced while it was read"):
         read(recorded)
     assert not list(home.glob("*out.npz*"))
+
+
+def test_a_dataset_deleted_while_it_is_verified(recorded: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After its arrays are read: Minari itself notices, with an error of its own."""
+    monkeypatch.setattr("offbench.verification.verify._counts", lambda *_: shutil.rmtree(home / "minari" / recorded))
+    with pytest.raises(offbench.OffbenchError, match="was replaced while it was read"):
+        offbench.verify(recorded)
+
+
+@pytest.mark.parametrize("overwrite", [[], ["--overwrite"]])
+def test_a_dataset_deleted_while_it_is_recorded(
+    overwrite: list[str],
+    recorded: str,
+    home: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = ["collect", "inverted-pendulum", "--level", "random", "--steps", "300", "--seed", "1", "--workers", "1"]
+    words += overwrite or ["--id", "new-v0"]
+    with monkeypatch.context() as patched:
+        patched.setattr(minari_store, "_check_room", lambda folder, *_: shutil.rmtree(folder))
+        assert "was moved or deleted while it was written" in refusal(words, capsys)
+    assert minari_store.local_ids() == [recorded]
+    main(words)
+    assert minari_store.provenance(minari_store.read_metadata(words[-1] if not overwrite else recorded))["seed"] == 1
 
 
 def test_reading_a_converted_dataset_takes_no_lock(recorded: str, home: Path) -> None:
