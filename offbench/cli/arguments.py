@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shutil
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Any, NoReturn
 from offbench.common.errors import OffbenchError, nearest
 from offbench.common.terminal import is_terminal
 
-HELP_COLUMN = 28  # where the help of an argument begins
+HELP_COLUMN = 28  # where the help of an argument begins, at the latest, on a terminal of 80 columns
 
 
 class Parser(argparse.ArgumentParser):
@@ -64,7 +65,7 @@ class Parser(argparse.ArgumentParser):
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str, **kwargs: Any) -> None:
-        super().__init__(prog, max_help_position=HELP_COLUMN, **kwargs)
+        super().__init__(prog, max_help_position=max(HELP_COLUMN, shutil.get_terminal_size().columns // 3), **kwargs)
 
     def add_usage(
         self, usage: str | None, actions: Iterable[argparse.Action], groups: Any, prefix: str | None = None
