@@ -103,7 +103,7 @@ try:
     main({words!r})
 except SystemExit as done:
     assert done.code in (0, None), done.code
-heavy = {{"torch", "numpy", "gymnasium", "minari", "mujoco", "h5py", "matplotlib", "rich"}} & sys.modules.keys()
+heavy = {{"torch", "numpy", "gymnasium", "minari", "mujoco", "h5py", "matplotlib", "rich", "filelock"}} & sys.modules.keys()
 assert not heavy, heavy
 """
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=home)

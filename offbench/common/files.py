@@ -16,8 +16,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from filelock import FileLock, Timeout
-
 from offbench.common.errors import DamagedError, OffbenchError
 
 JsonObject: TypeAlias = dict[str, Any]  # a JSON object whose values nothing has checked yet
@@ -87,6 +85,8 @@ def exclusive_lock(path: Path, what: str, timeout: float = ORPHANS) -> Iterator[
     Raises:
         OffbenchError: another process holds it; its process id and host are named.
     """
+    from filelock import FileLock, Timeout  # here, so that help comes at once
+
     path = path.absolute()
     lock, holder = FileLock(path), path.with_suffix(".holder")
     with disk_errors(str(path.parent)):
