@@ -103,8 +103,8 @@ try:
     main({words!r})
 except SystemExit as done:
     assert done.code in (0, None), done.code
-heavy = {{"torch", "numpy", "gymnasium", "minari", "mujoco", "h5py", "matplotlib", "rich", "filelock"}} & sys.modules.keys()
-assert not heavy, heavy
+heavy = {{"torch", "numpy", "gymnasium", "minari", "mujoco", "h5py", "matplotlib", "rich", "filelock"}}
+assert not heavy & sys.modules.keys(), heavy & sys.modules.keys()
 """
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=home)
 
