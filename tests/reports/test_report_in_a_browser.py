@@ -107,6 +107,12 @@ def test_tables_fit_on_a_printed_page(browser: Any, home: Path) -> None:
     assert page.evaluate("document.documentElement.scrollWidth") <= 1032
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
     assert page.locator("nav").is_hidden()
+    assert page.locator("#runs h2").is_hidden()  # its table is closed
+    page.emulate_media(media="screen")
+    page.locator("#runs summary").click()
+    page.emulate_media(media="print")
+    assert page.locator("#runs h2").is_visible()
+    assert page.locator("#runs td").first.is_visible()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
