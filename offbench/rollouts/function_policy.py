@@ -87,7 +87,7 @@ def function_policy(name: str, low: Array, high: Array) -> FunctionPolicy:
         sys.path.insert(0, os.getcwd())
     try:
         function = getattr(importlib.import_module(module), attribute, None)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         what = f"{type(error).__name__}: {error}"
         raise OffbenchError(f"cannot import the policy {name}: {what} ({SHOW_TRACEBACK})") from error
     if not callable(function):

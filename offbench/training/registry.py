@@ -56,7 +56,8 @@ def _entry_points() -> dict[str, list[importlib.metadata.EntryPoint]]:
         try:
             points = package.entry_points.select(group=GROUP)
         except Exception as error:  # a package whose metadata are damaged must not stop the others
-            warn(f"{package} has unreadable entry points ({error})")
+            where = getattr(package, "_path", package)  # its name may be unreadable too
+            warn(f"{where} has unreadable entry points ({error}); reinstall or remove this package")
             continue
         for point in points:
             if point not in (same := by_name.setdefault(point.name, [])):
@@ -131,7 +132,7 @@ def load_algorithm(name: str) -> type[Algorithm]:
         raise OffbenchError(f"two algorithms are named {name!r}: {point.value} and {others[0].value}; rename yours")
     try:
         kind = point.load()
-    except Exception as error:  # whatever its code raises
+    except (Exception, SystemExit) as error:  # whatever its code raises
         if is_exhausted(error):
             raise
         why = f"{type(error).__name__}: {error}"
@@ -196,7 +197,7 @@ def _from_file(reference: str) -> type[Algorithm]:
         sys.path.insert(0, str(path.parent))  # as Python does for a script, so that the file can import its neighbors
     try:
         module = importlib.import_module(path.stem)
-    except Exception as error:  # whatever its code raises
+    except (Exception, SystemExit) as error:  # whatever its code raises
         traceback.print_exception(error)
         raise OffbenchError(
             f"{text} does not import: {type(error).__name__}: {error}; see the traceback above"

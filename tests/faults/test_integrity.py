@@ -322,6 +322,30 @@ def test_an_error_in_an_installed_algorithm_keeps_its_traceback(
     assert "an error in mine: ZeroDivisionError: of mine" in said.splitlines()[-1]
 
 
+@pytest.mark.parametrize("fault", ["exits", "missing", "damaged", "binary", "gymnasium"])
+def test_a_broken_package_stops_nothing_else(fault: str, tmp_path: Path) -> None:
+    """It is named where it is asked for, or where its entry points cannot be read."""
+    package = tmp_path / "broken-1.0.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    group = "gymnasium.envs" if fault == "gymnasium" else "offbench.algos"
+    text = {"damaged": b"[offbench.algos\nbroken\n", "binary": b"[offbench.algos]\n\xf5 = x:Y\n"}
+    points = text.get(fault, f"[{group}]\nbroken = broken_module:Broken\n".encode())
+    (package / "entry_points.txt").write_bytes(points)
+    if fault in ("exits", "gymnasium"):
+        (tmp_path / "broken_module.py").write_text("raise SystemExit(3)\n")
+    path = {"PYTHONPATH": str(tmp_path)}
+    found = offbench("list", "algorithms", **path)
+    assert found.returncode == 0
+    assert "td3_bc" in found.stdout
+    assert (str(package) in found.stderr) == (fault == "binary")
+    asked = offbench("train", "broken", "--dataset", "x-v0", **path)
+    assert asked.returncode == 2
+    assert "Traceback" not in asked.stderr
+    words = {"exits": "does not import: SystemExit: 3", "missing": "No module named 'broken_module'"}
+    assert words.get(fault, "unknown algorithm 'broken'") in asked.stderr.splitlines()[-1]
+
+
 def test_damage_brings_no_error_of_a_parser_out() -> None:
     for error in (RecursionError(), KeyError("x"), StopIteration(), AssertionError("odd")):
         with pytest.raises(DamagedError, match="delete it"), files.damage("a.bin", "is damaged", "delete it"):

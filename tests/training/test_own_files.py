@@ -130,13 +130,18 @@ def test_mistakes_are_one_line(reference: str, home: Path, capsys: pytest.Captur
     assert MISTAKES[reference] in refusal(["train", reference, *WORDS], capsys)
 
 
-def test_a_file_that_does_not_import_shows_its_line(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (home / "awac.py").write_text("class AWAC(:\n")
+@pytest.mark.parametrize(
+    ("text", "error"), [("class AWAC(:\n", "SyntaxError"), ("raise SystemExit(3)", "SystemExit: 3")]
+)
+def test_a_file_that_does_not_import_shows_its_line(
+    text: str, error: str, home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (home / "awac.py").write_text(text)
     with pytest.raises(SystemExit):
         main(["train", "awac.py", *WORDS])
     said = capsys.readouterr().err
     assert 'awac.py", line 1' in said
-    assert said.splitlines()[-1].startswith("offbench: awac.py does not import: SyntaxError")
+    assert said.splitlines()[-1].startswith(f"offbench: awac.py does not import: {error}")
 
 
 @pytest.mark.parametrize("seeds", ["0", pytest.param("0,1", marks=pytest.mark.slow)])
