@@ -28,7 +28,7 @@ from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.progress import Progress
 from offbench.data import minari_store
 from offbench.data.file_stamps import unchanged
-from offbench.data.minari_reader import episodes_of, finite, flags, float32, open_minari, reading
+from offbench.data.minari_reader import episodes_of, finite, flags, float32, open_minari, reading, shape_faults
 from offbench.envs.environments import box
 
 if TYPE_CHECKING:
@@ -107,11 +107,8 @@ def _columns(data: MinariDataset, dataset_id: str, progress: Progress) -> Iterat
     """Yield the columns of one episode after another, checked to fit together."""
     seeds = _seed_columns(data, dataset_id)
     for e in episodes_of(data):
-        steps = len(e)
-        shapes = [array.shape[:1] for array in e.arrays]
-        dimensions = [array.ndim for array in e.arrays]
-        if not steps or shapes != [(steps + 1,)] + [(steps,)] * 4 or dimensions != [2, 2, 1, 1, 1]:
-            raise OffbenchError(f"{dataset_id}, episode {e.index}: its arrays do not fit; see `offbench verify`")
+        for fault in shape_faults(e, data.observation_space, data.action_space):
+            raise OffbenchError(f"{dataset_id}, episode {e.index}: {fault}; see `offbench verify`")
         for name in ("observations", "actions", "rewards"):
             finite(getattr(e, name), f"{dataset_id}, episode {e.index}: {name}")
         yield {
@@ -121,9 +118,9 @@ def _columns(data: MinariDataset, dataset_id: str, progress: Progress) -> Iterat
             "terminals": flags(e.terminations, f"{dataset_id}, episode {e.index}: terminations"),
             "timeouts": flags(e.truncations, f"{dataset_id}, episode {e.index}: truncations"),
             "next_observations": e.observations[1:],
-            **seeds(e.seed, steps),
+            **seeds(e.seed, len(e)),
         }
-        progress.to(progress.done + steps)
+        progress.to(progress.done + len(e))
 
 
 def _seed_columns(data: MinariDataset, dataset_id: str) -> Callable[[int | None, int], Columns]:

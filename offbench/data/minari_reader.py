@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
+from gymnasium.spaces import Box
 
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError
@@ -19,7 +20,7 @@ from offbench.common.files import damage, regular
 from offbench.data import minari_store
 
 if TYPE_CHECKING:
-    from minari import MinariDataset
+    from minari import EpisodeData, MinariDataset
 
 AGAIN = "record or download it again"
 LARGEST = float(np.finfo(np.float32).max)
@@ -76,6 +77,16 @@ def episodes_of(data: MinariDataset, indices: Iterable[int] | None = None) -> It
             flags = episode.terminations, episode.truncations
             arrays = map(np.asarray, (episode.observations, episode.actions, episode.rewards, *flags))
             yield Recorded(int(episode.id), None if seed is None else int(seed), *arrays)
+
+
+def shape_faults(episode: Recorded | EpisodeData, observations: Box, actions: Box) -> Iterator[str]:
+    """Yield what is wrong with the shapes of an episode: T + 1 observations, T of all else, T at least 1."""
+    steps = len(episode.rewards) if np.ndim(episode.rewards) else 0
+    shapes = {"observations": (steps + 1, *observations.shape), "actions": (steps, *actions.shape)}
+    for name, shape in (shapes | dict.fromkeys(("rewards", "terminations", "truncations"), (steps,))).items():
+        actual = np.shape(getattr(episode, name))
+        if actual != shape or not steps:
+            yield f"{name} have shape {actual}, expected {shape}"
 
 
 def open_minari(dataset_id: str) -> MinariDataset:

@@ -31,7 +31,7 @@ from offbench.common.progress import Progress
 from offbench.common.terminal import warn
 from offbench.data import minari_store
 from offbench.data.file_stamps import ReplacedError, Stamps, checked, recorded, unchanged
-from offbench.data.minari_reader import check_storage, flags, float32, open_parsed, reading
+from offbench.data.minari_reader import check_storage, flags, float32, open_parsed, reading, shape_faults
 from offbench.data.recorded_env import evaluation_spec
 from offbench.envs.environments import action_box, box, same_environment
 
@@ -281,18 +281,9 @@ def _episodes(data: MinariDataset, dataset_id: str) -> Iterator[EpisodeData]:
 def _episode_arrays(
     episode: EpisodeData, observations: gym.spaces.Box, actions: gym.spaces.Box, where: str
 ) -> dict[str, Array]:
-    """Return one episode's arrays as float32, checked: shapes, T + 1 observations, finite numbers."""
-    steps = len(episode.rewards) if np.ndim(episode.rewards) else 0
-    shapes = {
-        "observations": (steps + 1, *observations.shape),
-        "actions": (steps, *actions.shape),
-        "rewards": (steps,),
-        "terminations": (steps,),
-    }
-    for name, shape in shapes.items():
-        actual = np.shape(getattr(episode, name))
-        if actual != shape or not steps:
-            raise OffbenchError(f"{where}: {name} have shape {actual}, expected {shape}; the dataset is damaged")
+    """Return one episode's arrays as float32, checked: shapes and finite numbers."""
+    for fault in shape_faults(episode, observations, actions):
+        raise OffbenchError(f"{where}: {fault}; the dataset is damaged")
     flat = {name: float32(np.asarray(getattr(episode, name)), f"{where}: {name}") for name in NUMBERS}
     flat["masks"] = 1.0 - flags(np.asarray(episode.terminations), f"{where}: terminations").astype(np.float32)
     return flat

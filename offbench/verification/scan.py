@@ -11,7 +11,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.progress import Progress
-from offbench.data.minari_reader import Recorded, episodes_of
+from offbench.data.minari_reader import Recorded, episodes_of, shape_faults
 from offbench.data.minari_store import ContentHash
 from offbench.verification.findings import Findings
 
@@ -71,20 +71,10 @@ def _check(
     e: Recorded, observations: gym.spaces.Box, actions: gym.spaces.Box, limit: int | None, where: str, out: Findings
 ) -> bool:
     """Check one episode by itself; return whether its arrays fit together, so that it can be played again."""
-    steps = len(e)
-    wanted = {
-        "observations": (steps + 1, *observations.shape),
-        "actions": (steps, *actions.shape),
-        "rewards": (steps,),
-        "terminations": (steps,),
-        "truncations": (steps,),
-    }
-    sound = steps > 0
-    for name, shape in wanted.items():
-        array = getattr(e, name)
-        if array.shape != shape or not steps:
-            out.add("shape", where, f"{name} {array.shape}, expected {shape}")
-            sound = False
+    sound = True
+    for fault in shape_faults(e, observations, actions):
+        out.add("shape", where, fault)
+        sound = False
     for name, space in (("observations", observations), ("actions", actions)):
         if getattr(e, name).dtype != space.dtype:
             out.add("dtype", where, f"{name} are {getattr(e, name).dtype}, their space is {space.dtype}")
