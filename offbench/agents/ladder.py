@@ -11,7 +11,7 @@ import csv
 import dataclasses
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, damage, read_json, regular
 from offbench.common.scores import normalize
+from offbench.common.settings import read_back
 from offbench.common.terminal import inform, warn
 from offbench.envs.environments import same_environment
 from offbench.envs.recipes import Recipe, load_recipe, names
@@ -48,22 +49,54 @@ class Rung:
 
 
 @dataclass(frozen=True)
+class Replay:
+    """What a ladder.json says of medium-replay.hdf5."""
+
+    transitions: int
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class LadderInfo:
+    """A ladder's ladder.json.
+
+    Attributes:
+        references: `return`, its interval `low` to `high`, and `episodes` of the policies `random` and `expert`.
+        levels: the steps of the rungs `medium` and `expert`.
+        seed, steps, hours, sac, hardware, versions, command: of the training.
+    """
+
+    env_id: str
+    env_kwargs: JsonObject
+    references: dict[str, dict[str, int | float]]
+    levels: dict[str, int]
+    medium_replay: Replay
+    seed: int = 0
+    steps: int = 0
+    hours: float = 0.0
+    sac: JsonObject = field(default_factory=dict)
+    hardware: JsonObject = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    command: str = ""
+
+
+@dataclass(frozen=True)
 class Ladder:
     """A ladder's folder, read."""
 
     folder: Path
-    info: JsonObject
+    info: LadderInfo
     rungs: tuple[Rung, ...]
 
     @property
     def random_return(self) -> float:
         """Mean return of the uniform-random policy: the reference's 0."""
-        return float(self.info["references"]["random"]["return"])
+        return float(self.info.references["random"]["return"])
 
     @property
     def expert_return(self) -> float:
         """Mean return of the expert: the reference's 100."""
-        return float(self.info["references"]["expert"]["return"])
+        return float(self.info.references["expert"]["return"])
 
     def fraction(self, rung: Rung) -> float:
         """Return a rung's normalized return, 1 for the expert's."""
@@ -90,9 +123,9 @@ class Ladder:
     def check(self, recipe: Recipe) -> Ladder:
         """Return itself; raise OffbenchError if it is of another environment than the recipe."""
         kwargs = json.loads(json.dumps(dict(recipe.env_kwargs)))
-        if (self.info.get("env_id"), self.info.get("env_kwargs")) != (recipe.env_id, kwargs):
+        if (self.info.env_id, self.info.env_kwargs) != (recipe.env_id, kwargs):
             raise OffbenchError(
-                f"the ladder in {self.folder} is of {self.info.get('env_id')} {self.info.get('env_kwargs')}, "
+                f"the ladder in {self.folder} is of {self.info.env_id} {self.info.env_kwargs}, "
                 f"the recipe is of {recipe.env_id} {kwargs}; delete that folder, or rename the recipe"
             )
         return self
@@ -108,21 +141,19 @@ def read_ladder(folder: Path) -> Ladder | None:
     if not (folder / "ladder.json").exists():
         return None
     remedy = f"delete {folder} and build it again with `offbench behaviour`"
-    info = read_json(folder / "ladder.json", remedy)
+    path = folder / "ladder.json"
+    info = read_back(LadderInfo, read_json(path, remedy), path, remedy)
     with damage(f"the ladder in {folder}", "is damaged", remedy):
         with open(folder / "ladder.csv", newline="", encoding="utf-8", opener=regular) as file:
             rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
         ladder = Ladder(folder, info, rungs)
-        numbers = [float(info["references"][name][key]) for name in ("random", "expert") for key in REFERENCE]
-        numbers += [int(info["medium_replay"]["transitions"]), int(info["levels"]["medium"])]
-        if not (np.isfinite(numbers).all() and ladder.role("medium") and ladder.role("expert")):
-            raise ValueError("its references are not numbers")
-        if not ladder.random_return < ladder.expert_return or not isinstance(info["medium_replay"]["sha256"], str):
-            raise ValueError("its references are out of order, or medium-replay has no hash")
+        numbers = [info.references[name][key] for name in ("random", "expert") for key in REFERENCE]
+        if not np.isfinite(numbers).all() or not ladder.random_return < ladder.expert_return:
+            raise ValueError("its references are not finite, or out of order")
+        if not (info.levels["medium"] and ladder.role("medium") and ladder.role("expert")):
+            raise ValueError("it has no medium policy, or no expert")
         if gone := [rung.policy for rung in rungs if not (folder / "policies" / rung.policy).is_file()]:
             raise ValueError(f"it lacks policies/{gone[0]}")
-        if not isinstance(info.get("versions", {}), dict):
-            raise ValueError("its versions are not a table")
     return ladder
 
 
@@ -145,14 +176,14 @@ def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool =
     if not shipped:
         inform(f"using the behaviour agent trained here: {ladder.folder}")
         _warn_other_recipe(ladder, recipe)
-    warn_other_physics(f"the behaviour agent of {recipe.name}", ladder.info.get("versions", {}), recipe.env_spec())
+    warn_other_physics(f"the behaviour agent of {recipe.name}", ladder.info.versions, recipe.env_spec())
     return ladder
 
 
 def _warn_other_recipe(ladder: Ladder, recipe: Recipe) -> None:
     """Say which settings of the recipe have been changed since the agent was trained."""
-    used, wanted = ladder.info.get("sac"), json.loads(json.dumps(dataclasses.asdict(recipe.sac)))
-    changed = [key for key, value in wanted.items() if isinstance(used, dict) and used.get(key, value) != value]
+    used, wanted = ladder.info.sac, json.loads(json.dumps(dataclasses.asdict(recipe.sac)))
+    changed = [key for key, value in wanted.items() if used.get(key, value) != value]
     if changed:
         warn(
             f"that agent was trained with other [sac] settings than the recipe's "

@@ -121,8 +121,8 @@ def _recorded(recipe: Recipe, ladder: Ladder, level: str, collect: str) -> Summa
     parts = LEVELS[level]
     size = full_size(parts, recipe.dataset_steps)
     if parts[0].source == "replay":
-        size = int(ladder.info["medium_replay"]["transitions"])
-    same = ours.get("references") == ladder.info["references"] and ours.get("seed") == 0
+        size = ladder.info.medium_replay.transitions
+    same = ours.get("references") == ladder.info.references and ours.get("seed") == 0
     if not same or int(summary.lengths.sum()) != size:
         raise OffbenchError(
             f"{dataset_id} does not match the card (seed 0, {size:,.0f} transitions, the references of this ladder); "
@@ -152,7 +152,7 @@ def _facts(recipe: Recipe, summary: Summary) -> JsonObject:
 
 
 def _text(recipe: Recipe, ladder: Ladder, facts: JsonObject, made: Mapping[str, str]) -> Iterator[str]:
-    info, references = ladder.info, ladder.info["references"]
+    info, references = ladder.info, ladder.info.references
     yield f"# {recipe.name}: {recipe.env_id}"
     command = f"`offbench card {recipe.name}`"
     yield from (
@@ -178,15 +178,14 @@ def _text(recipe: Recipe, ladder: Ladder, facts: JsonObject, made: Mapping[str, 
         ],
     )
     yield from ("", "## Behaviour agent", "")
-    sac, where = info["sac"], info["hardware"]
     links = f"all saved policies: `{ladder.folder}`"
     if recipe.folder:
         rungs = "[behaviour/ladder.csv](behaviour/ladder.csv)"
         links = f"settings and their reasons: [recipe.toml](recipe.toml); all saved policies: {rungs}"
     yield (
-        f"Stable-Baselines3's SAC, seed {info['seed']}: {info['steps']:,} environment steps, "
-        f"{sac['gradient_steps']:g} gradient steps per environment step, {info['hours']:.1f} hours on one core "
-        f"({where['processor']}). Command: `{info['command']}`; {links}."
+        f"Stable-Baselines3's SAC, seed {info.seed}: {info.steps:,} environment steps, "
+        f"{info.sac['gradient_steps']:g} gradient steps per environment step, {info.hours:.1f} hours on one core "
+        f"({info.hardware['processor']}). Command: `{info.command}`; {links}."
     )
     yield ""
     yield (

@@ -145,7 +145,7 @@ def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:
 
 def _counts(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...], steps: int | None) -> list[int]:
     """Return the transitions of each part; medium-replay alone is as long as training made it."""
-    available = int(ladder.info["medium_replay"]["transitions"]) if ladder else 0
+    available = ladder.info.medium_replay.transitions if ladder else 0
     total = steps if steps is not None else _full_size(recipe, ladder, parts)
     counts = shares(parts, total)
     if 0 in counts:
@@ -161,7 +161,7 @@ def _counts(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...], step
 def _full_size(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...]) -> int:
     """Return the transitions of a dataset at its full size."""
     if ladder and len(parts) == 1 and parts[0].source == "replay":
-        return int(ladder.info["medium_replay"]["transitions"])
+        return ladder.info.medium_replay.transitions
     return full_size(parts, recipe.dataset_steps)
 
 
@@ -191,7 +191,7 @@ class _Recording:
     def references(self) -> JsonObject:
         """The random and the expert reference; without a ladder the random one, measured here as a ladder's is."""
         if self._ladder:
-            return dict(self._ladder.info["references"])
+            return dict(self._ladder.info.references)
         with Rollouts(self.spec, self.workers if self.workers > 1 else 0) as rollouts:
             return {"random": random_reference(self.recipe, 0, rollouts)}
 
@@ -253,7 +253,7 @@ class _Recording:
         """Yield a part's episodes, exactly `count` transitions: the last one is cut."""
         if part.source == "replay":
             low, high = self.action_space.low, self.action_space.high
-            expected = self.ladder.info["medium_replay"]["sha256"]
+            expected = self.ladder.info.medium_replay.sha256
             yield from cut_at(
                 load_replay(self.ladder.replay, expected, low, high, self.observation_space.dtype), count
             )
@@ -282,8 +282,8 @@ class _Recording:
         """Return a part's definition as measured, for the metadata."""
         described: JsonObject = {"source": part.source, "transitions": count}
         if part.source == "replay":
-            medium = self.ladder.info["levels"]["medium"]
-            return described | {"training_steps": medium, "sha256": self.ladder.info["medium_replay"]["sha256"]}
+            medium = self.ladder.info.levels["medium"]
+            return described | {"training_steps": medium, "sha256": self.ladder.info.medium_replay.sha256}
         if self.given is not None:
             made = {"policy": self.given.source, "algorithm": self.given.algorithm}
             return described | made | {"policy_sha256": self.given.sha256}

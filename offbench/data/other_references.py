@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 
 from offbench.agents.ladder import Ladder
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject
 from offbench.common.terminal import warn
 from offbench.data import minari_store
 from offbench.envs.recipes import Recipe
@@ -14,7 +14,7 @@ from offbench.envs.recipes import Recipe
 
 def warn_other_references(recipe: Recipe, ladder: Ladder) -> None:
     """Say which datasets of an environment were recorded with other references than its ladder has now."""
-    wanted = _scale(ladder.info["references"])
+    wanted = _scale(ladder.info.references)
     others = []
     for dataset_id in minari_store.local_ids():
         with contextlib.suppress(OffbenchError):
@@ -29,7 +29,7 @@ def warn_other_references(recipe: Recipe, ladder: Ladder) -> None:
         )
 
 
-def _scale(references: JsonObject) -> list[float] | None:
+def _scale(references: Mapping[str, Mapping[str, float]]) -> list[float] | None:
     try:
         return [references[name]["return"] for name in ("random", "expert")]
     except (KeyError, TypeError):

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from offbench.agents.build_ladder import RungEvaluator
-from offbench.agents.ladder import Ladder, Rung, folder_of, read_ladder
+from offbench.agents.ladder import Ladder, LadderInfo, Replay, Rung, folder_of, read_ladder
 from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common.errors import OffbenchError
 from offbench.data.levels import Part, parse_level, parse_mix, shares
@@ -142,7 +142,8 @@ def test_looking_for_the_nearest_rung_ends() -> None:
 
 
 def test_the_nearest_rung_of_a_ladder() -> None:
-    info = {"references": {"random": {"return": 10.0}, "expert": {"return": 110.0}}}
+    references = {"random": {"return": 10.0}, "expert": {"return": 110.0}}
+    info = LadderInfo(env_id="", env_kwargs={}, references=references, levels={}, medium_replay=Replay(0, ""))
     rungs = tuple(Rung(i, "", "", ret, ret, ret, 9) for i, ret in enumerate([20.0, 60.0, 75.0, 110.0]))
     ladder = Ladder(Path(), info, rungs)
     assert ladder.nearest(0.6).ret == 75.0

@@ -114,7 +114,7 @@ def test_medium_replay_is_every_transition_of_training(tiny: tuple[str, str]) ->
     recipe, behaviour_dir = tiny
     ladder = read_ladder(Path(behaviour_dir) / "tiny" / "seed-0" / "ladder")
     assert ladder is not None
-    until = ladder.info["levels"]["medium"]
+    until = ladder.info.levels["medium"]
     name = offbench.collect(recipe, "medium-replay", behaviour_dir=behaviour_dir)
     episodes = list(minari.load_dataset(name).iterate_episodes())
     assert sum(map(len, episodes)) == until
