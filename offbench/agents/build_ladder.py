@@ -289,7 +289,7 @@ def _write(
         shutil.rmtree(temporary, ignore_errors=True)
         (temporary / "policies").mkdir(parents=True)
         for step in roles:
-            # saved anew: a policy of an older offbench has no hash of its own yet
+            # rewritten, because policy files of earlier versions have no hash
             load_policy(folder.policy(step)).save(temporary / "policies" / folder.policy(step).name)
         write_bytes(temporary / "ladder.csv", csv_bytes(COLUMNS, _table(folder, rows, evaluator, roles)))
         info["medium_replay"] = save_replay(

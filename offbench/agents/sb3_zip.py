@@ -32,7 +32,7 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
         low, high: [act], the bounds of the environment's actions.
 
     Raises:
-        OffbenchError: not such a zip, a damaged or hostile one, or a policy that is not an MLP's.
+        OffbenchError: not such a zip, a damaged or malicious one, or a policy that is not an MLP's.
     """
     try:
         tensors, settings = _read(path)

@@ -70,7 +70,7 @@ class Method:
 
 
 def method_of(algorithm: str, variant: str, settings: Mapping[str, object]) -> Method:
-    """Return a method by itself, whatever other methods there are."""
+    """Return a method, named without regard to other methods."""
     return Method(algorithm, variant, _beta(settings.get("beta")))
 
 

@@ -141,7 +141,7 @@ TITLES: dict[str, str | None] = {
     "of_steps": None,  # shown as 50,000 of 1,000,000 in the steps column
     "score": "score (own ref.)",
     "score_std": None,
-    "iqm": None,  # of one dataset's few seeds it is near the mean: for programs, not for the eye
+    "iqm": None,  # in JSON and CSV only: over the few seeds of one dataset it is close to the mean
     "iqm_low": None,
     "iqm_high": None,
     "d4rl_score": "score (D4RL ref.)",

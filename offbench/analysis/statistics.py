@@ -23,7 +23,7 @@ Scores = Mapping[str, Sequence[float]]
 
 RESAMPLES = 10_000
 CURVE_RESAMPLES = 2_000  # for each point of a curve
-EXACT_FLIPS = 14  # so many pairs have few enough signs to try them all
+EXACT_FLIPS = 14  # up to this many pairs, all sign patterns are tried
 
 
 @dataclass(frozen=True)

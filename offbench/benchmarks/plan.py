@@ -25,8 +25,8 @@ from offbench.training.devices import Machine, pick_machine
 from offbench.training.run import Run
 from offbench.training.spec import RunSpec, settings_json, specs_of
 
-# What a large GPU is taken to do of a stack's small float32 products where there is none to measure: a seventh of an
-# H100's 67 Tflop/s.
+# operations a second assumed of a large GPU where none can be measured: a seventh of an H100's 67 Tflop/s, as the
+# products of a stack are small
 GPU_SPEED = 1e13
 
 

@@ -118,7 +118,7 @@ def _bar() -> Any:
 
 
 def duration(seconds: float) -> str:
-    """Return seconds as a person would say them: `3 h 12 min`, `4 min 10 s`, `12 s`."""
+    """Return a duration as text: `3 h 12 min`, `4 min 10 s`, `12 s`."""
     if seconds == float("inf"):
         return "?"
     seconds = round(seconds)

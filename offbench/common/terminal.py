@@ -1,4 +1,4 @@
-"""What a person reads: tables, hints and errors, in color on a terminal and as plain text in a pipe or a file.
+"""Output for people: tables, hints and errors, in color on a terminal and as plain text in a pipe or a file.
 
 rich is imported only to write to a terminal, so that a short command stays fast. NO_COLOR and TERM=dumb are respected.
 """
@@ -26,7 +26,7 @@ GLUE = "\0"  # stands for a space that is no place to break a line
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Return whether a person reads this stream now."""
+    """Return whether a stream is a terminal."""
     return stream is not None and stream.isatty()
 
 
@@ -146,7 +146,7 @@ def print_table(
 
     def narrow(least: int) -> None:
         texts = [column for column in shown if column < names]
-        while missing() > 0 and max(widths[column] for column in texts) > least:  # the widest name gives way first
+        while missing() > 0 and max(widths[column] for column in texts) > least:  # the widest name shrinks first
             widths[max(texts, key=widths.__getitem__)] -= 1
 
     narrow(NARROW)

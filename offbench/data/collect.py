@@ -30,10 +30,10 @@ from offbench.rollouts.function_policy import FunctionPolicy
 from offbench.rollouts.policy import Policy, uniform
 from offbench.rollouts.rollouts import Episode, Rollouts
 
-# What of the metadata makes two recordings the same one, with the versions that shape what an episode is.
 POLICY = "policy"  # the source of a part that a user's own policy plays
 AGENTLESS = ("uniform", POLICY)  # sources that need no behaviour agent
-WHAT_IT_IS = ("env", "level", "seed", "recipe_sha256", "parts", "references")
+# two recordings with the same values of these metadata, on the same versions of these packages, are the same
+IDENTITY = ("env", "level", "seed", "recipe_sha256", "parts", "references")
 PHYSICS = ("mujoco", "gymnasium", "numpy")
 HOME = "https://github.com/offbench/offbench"
 
@@ -105,7 +105,7 @@ def collect(
     ladder = find_ladder(recipe, Path(behaviour_dir), retrain)
     trained = ladder is not None or all(part.source in AGENTLESS for part in parts)
     prepared = prepare(ladder) if trained else None
-    if prepared and not overwrite and minari_store.exists(dataset_id) and _is(dataset_id, prepared[-1]):
+    if prepared and not overwrite and minari_store.exists(dataset_id) and _is_same(dataset_id, prepared[-1]):
         minari_store.tidy(dataset_id)
         inform(f"{dataset_id} is recorded already, from the same policies and seed")
         return dataset_id
@@ -126,12 +126,12 @@ def collect(
     return dataset_id
 
 
-def _is(dataset_id: str, wanted: JsonObject) -> bool:
+def _is_same(dataset_id: str, wanted: JsonObject) -> bool:
     """Return whether a dataset was recorded from what `wanted`, its metadata to be, says, on this physics."""
     recorded = minari_store.provenance(minari_store.read_metadata(dataset_id))
     ours = json.loads(json.dumps(minari_store.provenance(wanted)))  # as it was written: tuples are lists
     made = [{name: part.get("versions", {}).get(name) for name in PHYSICS} for part in (recorded, ours)]
-    return all(recorded.get(key) == ours[key] for key in WHAT_IT_IS) and made[0] == made[1]
+    return all(recorded.get(key) == ours[key] for key in IDENTITY) and made[0] == made[1]
 
 
 def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:

@@ -20,7 +20,7 @@ from offbench.envs.margin_rule import without_margin
 COLUMNS = ("observations", "actions", "rewards", "terminals")
 SEEDS = ("infos/seed", "infos/seeded")  # seeded: where some episodes have a seed of 2**63 or more, and some none
 OPTIONAL = ("timeouts", "next_observations", *SEEDS)
-MOST_COMPRESSED = 1000  # times smaller than its numbers: no honest file is
+MOST_COMPRESSED = 1000  # largest ratio of a column's size to the file's: more is a damaged or malicious file
 
 
 @dataclass(frozen=True)

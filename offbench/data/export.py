@@ -1,7 +1,7 @@
 """`export`: a Minari dataset as a D4RL file, or as the arrays that D4RL's loader would make of it.
 
 d4rl   HDF5, the recorded numbers as they are: what D4RL's get_dataset reads, and with it CORL and the TD3+BC
-       author's code. Minari's metadata travel in the file's attributes, seeds in infos/seed: `import-d4rl` gives
+       author's code. Minari's metadata are in the file's attributes, seeds in infos/seed: `import-d4rl` gives
        the same dataset back.
 npz    float32, the keys of D4RL's qlearning_dataset: what their replay buffers take.
 """
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from minari import MinariDataset
 
 FORMATS = {"d4rl": (".hdf5", ".h5"), "npz": (".npz",)}  # and how their files end
-TRAVELS = (  # Minari's metadata that go along
+METADATA = (  # of Minari, that an export keeps
     *("env_spec", "eval_env_spec", "algorithm_name", "description", "author", "author_email", "requirements"),
     *("ref_min_score", "ref_max_score", "num_episodes_average_score", minari_store.KEY),
 )
@@ -140,8 +140,8 @@ def _seed_columns(data: MinariDataset, dataset_id: str) -> Callable[[int | None,
 
 
 def _about(data: MinariDataset, metadata: JsonObject) -> str:
-    """Return the metadata that travel, as JSON."""
-    about = {key: metadata[key] for key in TRAVELS if metadata.get(key) is not None}
+    """Return the metadata that the file keeps, as JSON."""
+    about = {key: metadata[key] for key in METADATA if metadata.get(key) is not None}
     about |= {key: serialize_space(getattr(data, key)) for key in ("observation_space", "action_space")}
     text = json.dumps(about)
     if len(text.encode()) > ATTRIBUTE:

@@ -1,4 +1,4 @@
-"""A dataset's episodes through Minari, nothing believed yet."""
+"""A dataset's episodes as Minari reads them, unchecked."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def reading(dataset_id: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Recorded:
-    """An episode as a dataset has it, nothing believed yet. Arrays as in Minari's EpisodeData."""
+    """An episode as a dataset has it, unchecked. Arrays as in Minari's EpisodeData."""
 
     index: int
     seed: int | None

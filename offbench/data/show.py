@@ -54,7 +54,7 @@ class Summary:
         return lines + (shown or ["not recorded by offbench"])
 
     def __repr__(self) -> str:
-        """Return what a person types to see more."""
+        """Return id and size, and how to see more."""
         return f"Summary({self.dataset_id}, {len(self.returns):,} episodes; `lines()` has more)"
 
     def plot(self, path: str | Path) -> Path:
@@ -85,7 +85,7 @@ def show(dataset_id: str) -> Summary:
 
 
 def fact(value: object) -> str:
-    """Return a value of the metadata as a person writes it."""
+    """Return a value of the metadata as text."""
     if isinstance(value, bool) or not isinstance(value, int | float | list):
         return str(value)
     if isinstance(value, list):

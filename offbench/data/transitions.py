@@ -290,7 +290,7 @@ def _episode_arrays(
 
 
 def _scaled(actions: Array, space: gym.spaces.Box, dataset_id: str) -> Array:
-    """Return actions scaled from the space's bounds to [-1, 1]; what lies outside is clipped, and said."""
+    """Return actions scaled from the space's bounds to [-1, 1]; actions outside are clipped, with a warning."""
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     scaled = 2.0 * (actions - low) / (high - low) - 1.0
     outside = int((np.abs(scaled) > 1 + CLIP_TOLERANCE).any(1).sum())

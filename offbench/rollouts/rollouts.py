@@ -38,8 +38,8 @@ from offbench.rollouts.policy import Policy, from_bytes
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 LANES = 16  # episodes that share a policy forward
-TASK = 16  # episodes that travel together
-LAST_TASK = 4  # where a recording ends, fewer travel together
+TASK = 16  # episodes of a task
+LAST_TASK = 4  # near the end of a recording, where large tasks would leave workers idle
 NOISE_BLOCK = 1024  # actions whose noise is drawn at once
 
 

@@ -161,14 +161,14 @@ def _spread(episodes: Iterator[Episode], count: int) -> Iterator[tuple[Array, Ar
 def _algorithms() -> Iterator[tuple[str, str]]:
     from offbench.training.registry import algorithm_names, load_algorithm
 
-    well = []
+    loaded = []
     for name in algorithm_names():
         try:
             load_algorithm(name)
-            well.append(name)
+            loaded.append(name)
         except OffbenchError as error:
             yield BROKEN, str(error)
-    yield (OK, ", ".join(well)) if well else (BROKEN, "none is registered; install the package: pip install .")
+    yield (OK, ", ".join(loaded)) if loaded else (BROKEN, "none is registered; install the package: pip install .")
 
 
 def _cache() -> Iterator[tuple[str, str]]:

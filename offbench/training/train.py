@@ -158,7 +158,7 @@ class Training:
         """Train what is left.
 
         Args:
-            execute: trains jobs, so many at a time, and returns what went wrong, a line each.
+            execute: trains jobs, up to a number at a time, and returns what went wrong, a line each.
             deadline: `time.time()` to stop at, with checkpoints.
             cost: seconds per update of each algorithm, for the time left.
 

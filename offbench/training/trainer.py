@@ -155,7 +155,7 @@ class Trainer:
                 self.stack.step = step
                 break
         for i, run in enumerate(self.runs):
-            if self.stack.step and not run.policy_path.exists():  # somebody deleted it: the checkpoint has it
+            if self.stack.step and not run.policy_path.exists():  # deleted by the user; the checkpoint has it
                 self.stack.policy(i).save(run.policy_path)
             if self.stack.step and not run.losses_path.exists():
                 inform(f"{run.losses_path} is missing; it starts again at this step")

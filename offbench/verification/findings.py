@@ -1,4 +1,4 @@
-"""What `verify` can find: a code for programs, words and a remedy for people, and where it was seen."""
+"""The faults that `verify` reports: a code for programs, a description and a remedy for people."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ FAULTS: dict[str, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One kind of fault, wherever it was seen."""
+    """One kind of fault, and where in the dataset it occurs."""
 
     code: str
     where: str
@@ -87,7 +87,7 @@ class Findings:
         self._seen: dict[str, list[tuple[str, str]]] = {}
 
     def add(self, code: str, where: str, detail: str = "") -> None:
-        """Take in one sighting. `detail` tells more than the code's own words."""
+        """Record one occurrence. `detail` says more than the code's description."""
         assert code in FAULTS, code
         self._seen.setdefault(code, []).append((where, detail))
 

@@ -15,7 +15,7 @@ from offbench.data.levels import LEVELS
 from offbench.verification.findings import Findings, Report
 from offbench.verification.scan import Survey
 
-SIGMAS = 6  # a level's mean return may be off by so many standard errors,
+SIGMAS = 6  # standard errors that a level's mean return may be off by,
 SLACK = 0.02  # and by this share of the references' distance: rungs are chosen for their measured return
 
 

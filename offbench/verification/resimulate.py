@@ -126,7 +126,7 @@ def _piled(actions: Array, space: gym.spaces.Box) -> Array:
 
 
 class _State:
-    """Puts a MuJoCo environment into the state that an observation tells of."""
+    """Puts a MuJoCo environment into the state that an observation describes."""
 
     def __init__(self, env: Any, skipped: int) -> None:
         self.env = env
@@ -142,12 +142,12 @@ class _State:
 
     @classmethod
     def of(cls, env: Env) -> _State | None:
-        """Return the way to set the state, or None where the observation does not tell all of it."""
+        """Return the way to set the state, or None where the observation does not determine it."""
         inner: Any = env.unwrapped
         if not (hasattr(inner, "set_state") and hasattr(getattr(inner, "model", None), "nq")):
             return None
         dim = env.observation_space.shape[0]  # type: ignore[index]
-        # the positions that are left out are x (and y); older versions of the environments do not say which
+        # the positions that are left out are x (and y); older versions of the environments do not list them
         said = getattr(inner, "observation_structure", {}).get("skipped_qpos")
         for skipped in (0, 1, 2) if said is None else (said,):
             state = cls(inner, skipped)

@@ -166,11 +166,11 @@ def _play(
                     "policies are evaluated with them"
                 )
         verdicts = replay(with_margin(spec, rule or EARLIER), episodes_of(data, names))
-    _tell(verdicts, made if exact else None, report, findings)
+    _report(verdicts, made if exact else None, report, findings)
 
 
 def _same_spaces(spec: str, data: MinariDataset, report: Report, findings: Findings) -> bool:
-    """Return whether the environment can be made and has the dataset's spaces; say what hinders it."""
+    """Return whether the environment can be made and has the dataset's spaces; report why not."""
     try:
         env = believed_env(spec, "playing episodes again")
     except OffbenchError as error:
@@ -196,7 +196,7 @@ def _choose(survey: Survey, limit: int | None, last: Sequence[int], episodes: in
     return sorted({*sample, *suspects, *(i for i in last if survey.sound[i])})
 
 
-def _tell(verdicts: Sequence[Verdict], mujoco: str | None, report: Report, findings: Findings) -> None:
+def _report(verdicts: Sequence[Verdict], mujoco: str | None, report: Report, findings: Findings) -> None:
     ways = {
         "seed": f"from their seeds, {f'bit for bit (mujoco {mujoco})' if mujoco else 'within a tolerance'}",
         "step": "one step at a time from recorded states",
