@@ -20,7 +20,7 @@ from offbench.data import minari_store
 from offbench.data.levels import full_size, parse_level
 from offbench.data.recorded_env import evaluation_spec
 from offbench.envs.environments import believed_env, make_env, spaces_of
-from offbench.envs.recipes import Recipe, load_recipe
+from offbench.envs.recipes import load_recipe
 from offbench.training.devices import Machine, pick_machine
 from offbench.training.run import Run
 from offbench.training.spec import RunSpec, settings_json, specs_of
@@ -118,7 +118,7 @@ class Plan:
         yield f"{bench.grid.name}: {text}, {sum(map(len, left))} to train"
         if not any(left):
             return
-        env_specs = {source.env: _recipe(source).env_spec() for source in bench.grid.datasets if source.env}
+        env_specs = {source.env: load_recipe(source.env).env_spec() for source in bench.grid.datasets if source.env}
         given = bench.variants[0][0].env_spec
         env_specs = {"": given} if given else env_specs or {"": _recorded_env_spec(bench.grid.datasets[0])}
         env_spec = next(iter(env_specs.values()))  # for the shapes, which differ little
@@ -172,10 +172,6 @@ def _cost(spec: RunSpec, rate: Rate, play: float, env_spec: str) -> float:
     return spec.steps / rate.updates + episodes * length * play
 
 
-def _recipe(source: Source) -> Recipe:
-    return load_recipe(source.env)
-
-
 def _recorded_env_spec(source: Source) -> str:
     spec = evaluation_spec(minari_store.read_metadata(source.id))
     if spec is None:
@@ -189,7 +185,7 @@ def _size(source: Source) -> int:
     if source.steps or not source.env:
         return source.steps or 0
     _, parts = parse_level(source.level)
-    return full_size(parts, _recipe(source).dataset_steps)
+    return full_size(parts, load_recipe(source.env).dataset_steps)
 
 
 def _bytes_per_step(spec: str) -> int:

@@ -61,11 +61,13 @@ def recorded_margin(metadata: JsonObject) -> str | None:
 
 def _demands(metadata: JsonObject) -> list[tuple[str, str, str]]:
     """Return (operator, major, minor) of each demand that Minari's requirements make on MuJoCo's version."""
-    listed = metadata.get("requirements")
-    ours = (
-        [str(item) for item in listed if re.match(r"\s*mujoco\b(?!-)", str(item))] if isinstance(listed, list) else []
-    )
+    ours = (item for item in _requirements(metadata) if re.match(r"\s*mujoco\b(?!-)", item))
     return [clause for item in ours for clause in CLAUSE.findall(item)]
+
+
+def _requirements(metadata: JsonObject) -> list[str]:
+    listed = metadata.get("requirements")
+    return list(map(str, listed)) if isinstance(listed, list) else []
 
 
 def recorded_mujoco(metadata: JsonObject) -> str | None:
@@ -73,12 +75,8 @@ def recorded_mujoco(metadata: JsonObject) -> str | None:
     made = minari_store.provenance(metadata).get("versions")
     if isinstance(made, dict) and "mujoco" in made:
         return str(made["mujoco"])
-    listed = metadata.get("requirements")
-    for requirement in listed if isinstance(listed, list) else []:
-        pinned = re.fullmatch(r"mujoco\s*==\s*([\w.]+)", str(requirement))
-        if pinned:
-            return pinned[1]
-    return None
+    pinned = (re.fullmatch(r"mujoco\s*==\s*([\w.]+)", item) for item in _requirements(metadata))
+    return next((match[1] for match in pinned if match), None)
 
 
 def margins_matter(spec: str) -> bool:

@@ -12,8 +12,7 @@ import io
 import json
 import os
 import warnings
-from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -86,7 +85,7 @@ def video(
         rate = float(world.metadata.get("render_fps") or fps)
         every = max(1, round(rate / fps))
         most = seconds * rate if seconds else float("inf")
-        encode(target, _episodes(_Recording(world, policy, sampled, every, size), seed, episodes, most), rate / every)
+        encode(target, _frames(world, policy, sampled, seed, episodes, every, most, size), rate / every)
     return target
 
 
@@ -135,40 +134,26 @@ def _renderable(spec: str, backend: str | None) -> Env:
     return env
 
 
-@dataclass(frozen=True)
-class _Recording:
-    """What to record: environment, policy, whether to sample actions, steps per frame, longer side in pixels."""
-
-    env: Env
-    policy: Policy
-    sampled: bool
-    every: int
-    size: int
-
-
-def _episodes(recording: _Recording, seed: int, count: int, most: float) -> Iterator[Image]:
-    """Yield the frames of one episode after another, `most` steps in all."""
-    for index in range(count):
-        if most > 0:
-            most -= yield from _episode(recording, seed, index, most)
-
-
-def _episode(recording: _Recording, seed: int, index: int, most: float) -> Generator[Image, None, int]:
-    """Play one episode; yield a frame every few steps, and the last one; return the episode's steps."""
-    env, policy = recording.env, recording.policy
-    rng = seeds.generator(seed, Purpose.ACTION, *STREAM, index)
-    noisy = policy.needs_noise(not recording.sampled)
-    observation = reset(env, seeds.integer(seed, Purpose.RESET, *STREAM, index))
-    count, total, over = 0, 0.0, False
-    yield _frame(env, count, total, recording.size)
-    while not over:
-        noise = policy.draw(rng, 1) if noisy else None
-        observation, reward, terminated, truncated = step(env, policy.act(observation[None], noise)[0])
-        count, total = count + 1, total + reward
-        over = terminated or truncated or count >= most
-        if over or count % recording.every == 0:
-            yield _frame(env, count, total, recording.size)
-    return count
+def _frames(
+    env: Env, policy: Policy, sampled: bool, seed: int, episodes: int, every: int, most: float, size: int
+) -> Iterator[Image]:
+    """Play episodes, `most` steps in all; yield a frame of every `every` steps, and the first and last of each."""
+    noisy = policy.needs_noise(not sampled)
+    for index in range(episodes):
+        if most <= 0:
+            return
+        rng = seeds.generator(seed, Purpose.ACTION, *STREAM, index)
+        observation = reset(env, seeds.integer(seed, Purpose.RESET, *STREAM, index))
+        count, total, over = 0, 0.0, False
+        yield _frame(env, count, total, size)
+        while not over:
+            noise = policy.draw(rng, 1) if noisy else None
+            observation, reward, terminated, truncated = step(env, policy.act(observation[None], noise)[0])
+            count, total = count + 1, total + reward
+            over = terminated or truncated or count >= most
+            if over or count % every == 0:
+                yield _frame(env, count, total, size)
+        most -= count
 
 
 def _frame(env: Env, step: int, total: float, size: int) -> Image:

@@ -14,8 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from offbench.analysis.methods import Method
-from offbench.analysis.results import Entry, Folders, Results, read_results
+from offbench.analysis.results import Folders, Results, read_results
 from offbench.common.errors import OffbenchError
 from offbench.common.files import write_together
 from offbench.common.tables import Table, files
@@ -23,7 +22,7 @@ from offbench.common.text import counted, plural
 from offbench.reports import figures as draw
 from offbench.reports import tables
 from offbench.reports.datasets import cards, dataset_table
-from offbench.reports.figures import Figure, Line
+from offbench.reports.figures import Figure
 from offbench.reports.markup import Markup, join, tag
 from offbench.reports.page import Section, boxes, figures, page, relative, table
 from offbench.reports.similarity import similarity_tables
@@ -93,19 +92,14 @@ def _older(folder: Path) -> set[Path]:
 
 
 def _tables(results: Results) -> dict[str, Table]:
-    all_tables = [tables.score_table(results), tables.seed_table(results), dataset_table(results)]
-    if best := best_table(results):
-        all_tables.append(best)
-    all_tables += similarity_tables(results)
-    beside = tables.beside_table(results)
     aggregates = tables.iqms(results)
-    if beside:
-        all_tables.append(beside)
-    if aggregates:
-        all_tables.append(tables.iqm_table(results, aggregates))
-    if len(aggregates) > 1:
-        all_tables.append(tables.improvement_table(results, aggregates))
-    return {one.name: one for one in all_tables}
+    all_tables = [
+        *(tables.score_table(results), tables.seed_table(results), dataset_table(results), best_table(results)),
+        *(*similarity_tables(results), tables.beside_table(results)),
+        tables.iqm_table(results, aggregates) if aggregates else None,
+        tables.improvement_table(results, aggregates) if len(aggregates) > 1 else None,
+    ]
+    return {one.name: one for one in all_tables if one}
 
 
 def _figures(results: Results) -> dict[str, list[Figure]]:
@@ -119,19 +113,15 @@ def _figures(results: Results) -> dict[str, list[Figure]]:
     for entries, stem in zip(rows, stems, strict=True):
         groups["curves"].append(draw.curve_figure(entries, looks, f"curves-{stem}"))
         groups["finals"].append(draw.final_figure(entries, looks, f"finals-{stem}"))
-        groups["beta"] += _loss(entries, looks, f"beta-{stem}", "beta", "β")
-        groups["q"] += _loss(entries, looks, f"q-{stem}", "q_abs", "mean |Q1(s, a)|")
+        for group, column, label in (("beta", "beta", "β"), ("q", "q_abs", "mean |Q1(s, a)|")):
+            if figure := draw.loss_figure(entries, looks, f"{group}-{stem}", column, label):
+                groups[group].append(figure)
     aggregates = tables.iqms(results)
     if aggregates:
         groups["iqm"] = [draw.iqm_figure(aggregates, looks), draw.profile_figure(aggregates, looks)]
     if len(results.tasks) > 1 and aggregates and (over_all := draw.iqm_curve_figure(results, looks)):
         groups["curves"].append(over_all)
     return groups
-
-
-def _loss(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str, column: str, label: str) -> list[Figure]:
-    figure = draw.loss_figure(entries, looks, name, column, label)
-    return [figure] if figure else []
 
 
 def _stems(names: Sequence[str]) -> list[str]:

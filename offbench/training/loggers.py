@@ -13,7 +13,6 @@ import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from types import TracebackType
-from typing import Protocol
 
 import numpy as np
 
@@ -49,22 +48,12 @@ class Destinations:
 NOWHERE = Destinations()
 
 
-class Sink(Protocol):
-    """One live view of one run."""
-
-    def write(self, losses: Losses, evaluations: Evaluations) -> None:
-        """Send the rows of a run that were not sent yet."""
-
-    def close(self) -> None:
-        """Close the view."""
-
-
 class Loggers(contextlib.AbstractContextManager["Loggers"]):
     """The live views of a job's runs, open while it trains."""
 
     def __init__(self, runs: Sequence[Run], show: Destinations) -> None:
         self.runs, self.show = list(runs), show
-        self.sinks: list[list[Sink]] = [[] for _ in runs]
+        self.sinks: list[list[TensorBoard | WandB]] = [[] for _ in runs]
 
     def __enter__(self) -> Loggers:
         for run, sinks in zip(self.runs, self.sinks, strict=True):
