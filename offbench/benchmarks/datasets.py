@@ -70,14 +70,14 @@ def _differences(metadata: JsonObject, source: Source, recipe: Recipe) -> Iterat
             f", not {recipe.env_id}" if env_id != recipe.env_id else " with other settings"
         )
     provenance = minari_store.provenance(metadata)
-    if "level" in provenance and _level_name(provenance["level"]) != _level_name(source.level):
-        yield f"level {provenance['level']}, not {source.level}"
-    if provenance.get("seed", source.seed) != source.seed:
-        yield f"seed {provenance['seed']}, not {source.seed}"
+    if provenance.level is not None and _level_name(provenance.level) != _level_name(source.level):
+        yield f"level {provenance.level}, not {source.level}"
+    if provenance.seed not in (None, source.seed):
+        yield f"seed {provenance.seed}, not {source.seed}"
     _, parts = parse_level(source.level)
     if source.steps or parts[0].source != "replay":  # a replay is as long as its training
         steps = source.steps or full_size(parts, recipe.dataset_steps)
-        if provenance and metadata.get("total_steps", steps) != steps:
+        if metadata.get(minari_store.KEY) and metadata.get("total_steps", steps) != steps:
             yield f"{metadata['total_steps']:,} transitions, not {steps:,}"
 
 

@@ -122,7 +122,7 @@ def _recorded(recipe: Recipe, ladder: Ladder, level: str, collect: str) -> Summa
     size = full_size(parts, recipe.dataset_steps)
     if parts[0].source == "replay":
         size = ladder.info.medium_replay.transitions
-    same = ours.get("references") == ladder.info.references and ours.get("seed") == 0
+    same = ours.references == ladder.info.references and ours.seed == 0
     if not same or int(summary.lengths.sum()) != size:
         raise OffbenchError(
             f"{dataset_id} does not match the card (seed 0, {size:,.0f} transitions, the references of this ladder); "
@@ -147,7 +147,7 @@ def _facts(recipe: Recipe, summary: Summary) -> JsonObject:
         "score": round(normalize(mean, float(meta["ref_min_score"]), float(meta["ref_max_score"])), 2) + 0.0,  # no -0
         "d4rl_score": d4rl,
         "terminated": round(summary.terminated, 4),
-        "content_sha256": minari_store.provenance(meta)["content_sha256"],
+        "content_sha256": minari_store.provenance(meta).content_sha256,
     }
 
 

@@ -129,9 +129,9 @@ def collect(
 def _is_same(dataset_id: str, wanted: JsonObject) -> bool:
     """Return whether a dataset was recorded from what `wanted`, its metadata to be, says, on this physics."""
     recorded = minari_store.provenance(minari_store.read_metadata(dataset_id))
-    ours = json.loads(json.dumps(minari_store.provenance(wanted)))  # as it was written: tuples are lists
-    made = [{name: part.get("versions", {}).get(name) for name in PHYSICS} for part in (recorded, ours)]
-    return all(recorded.get(key) == ours[key] for key in IDENTITY) and made[0] == made[1]
+    ours = minari_store.provenance(json.loads(json.dumps({minari_store.KEY: wanted[minari_store.KEY]})))  # as written
+    same = all(recorded.versions.get(name) == ours.versions.get(name) for name in PHYSICS)
+    return same and all(getattr(recorded, key) == getattr(ours, key) for key in IDENTITY)
 
 
 def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:

@@ -88,7 +88,7 @@ def _write(dataset_id: str, path: Path, style: str, drop_timeouts: bool) -> None
         if style == "d4rl":
             _write_d4rl(path, columns, _about(data, metadata))
         else:
-            dropped = minari_store.provenance(metadata).get("timeouts") == "dropped"
+            dropped = minari_store.provenance(metadata).timeouts == "dropped"
             _write_npz(path, (_float32(part, dataset_id) for part in columns), drop_timeouts, dropped)
 
 

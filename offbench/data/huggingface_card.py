@@ -62,13 +62,13 @@ def _text(summary: Summary) -> Iterator[str]:
     yield from (f"offbench verify {dataset_id}", f"offbench train td3_bc --dataset {dataset_id}", "```")
     yield from ("", "## Content", "")
     yield from _table(_content(summary))
-    for number, part in enumerate(ours.get("parts", []), 1):
+    for number, part in enumerate(ours.parts or (), 1):
         yield from ("", f"## Part {number}", "")
         yield from _table({key.replace("_", " "): fact(value) for key, value in part.items()})
     yield from ("", "## Provenance", "")
-    told = {name: ours.get(name) for name in ("env", "level", "seed", "recipe_sha256", "content_sha256")}
-    told["imported from"] = ours.get("imported", {}).get("file")
-    told |= ours.get("versions", {})
+    told = {name: getattr(ours, name) for name in ("env", "level", "seed", "recipe_sha256", "content_sha256")}
+    told["imported from"] = ours.imported.get("file")
+    told |= ours.versions
     recorded = {name.replace("_", " "): fact(value) for name, value in told.items() if value is not None}
     yield from _table(recorded) if recorded else ["Not recorded by offbench."]
 

@@ -9,6 +9,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,10 @@ from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
 from offbench.common.files import JsonObject, disk_errors, exclusive_lock, read_json
 from offbench.common.hdf5_file import SafeFile, safe_file
+from offbench.common.settings import read_back, setting
 from offbench.data.levels import parse_level
 from offbench.envs.environments import Space
-from offbench.envs.margin_rule import ADDED, EARLIER, MARGIN, without_margin
+from offbench.envs.margin_rule import ADDED, EARLIER, without_margin
 from offbench.envs.recipes import load_recipe, names
 from offbench.rollouts.rollouts import Episode
 
@@ -31,6 +33,38 @@ with warnings.catch_warnings():
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_dataset import parse_dataset_id
     from minari.dataset.minari_storage import MinariStorage
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """What offbench recorded about a dataset; all empty for datasets that it did not record.
+
+    Attributes:
+        parts: definition and measured return of each part, as in offbench.data.levels.
+        full_size: transitions at the recipe's size.
+        references: the episodes behind `ref_min_score` (`random`) and `ref_max_score` (`expert`).
+        d4rl: D4RL's reference scores.
+        imported: the D4RL file that the dataset was imported from.
+        timeouts: of an import: whether the steps at a timeout are `kept` or `dropped`.
+        final_observations: of an import: whether the last observations of terminated episodes are `kept`, or the
+            ones before `repeated`.
+    """
+
+    env: str | None = None
+    level: str | None = None
+    seed: int | None = None
+    recipe_sha256: str | None = None
+    parts: tuple[JsonObject, ...] | None = None
+    full_size: int | None = None
+    references: JsonObject = field(default_factory=dict)
+    d4rl: tuple[float, float] | None = None
+    contact_margin: str | None = setting(None, "", choices=(EARLIER, ADDED))
+    versions: dict[str, str] = field(default_factory=dict)
+    content_sha256: str | None = None
+    imported: JsonObject = field(default_factory=dict)
+    timeouts: str | None = None
+    final_observations: str | None = None
+
 
 KEY = "offbench"  # under which all that Minari has no field for is kept in the metadata
 BYTES_PER_EPISODE = 14_000  # what HDF5 needs in addition to the numbers, measured on short episodes
@@ -130,6 +164,8 @@ def read_metadata(dataset_id: str) -> JsonObject:
         _check_metadata(metadata)
     except (ValueError, TypeError, RecursionError) as error:
         raise DamagedError(f"{path} is damaged: {error}; {remedy}") from None
+    if metadata.get(KEY) is not None:
+        read_back(Provenance, metadata[KEY], path, remedy)
     return metadata
 
 
@@ -148,19 +184,6 @@ def _check_metadata(metadata: JsonObject) -> None:
         spec = json.loads(metadata.get(key) or "null")
         if spec is not None and not (isinstance(spec, dict) and isinstance(spec.get("id"), str)):
             raise ValueError(f"{key} names no environment")
-    ours = metadata.get(KEY)
-    if ours is None:
-        return
-    kinds = {"versions": dict, "references": dict, "imported": dict, "parts": list, "content_sha256": str}
-    for key, kind in kinds.items():
-        if not isinstance(ours, dict) or not isinstance(ours.get(key, kind()), kind):
-            raise ValueError(f"{KEY}.{key} is of another kind")
-    if ours.get(MARGIN) not in (EARLIER, ADDED, None):
-        raise ValueError(f"{KEY}.{MARGIN} is {str(ours[MARGIN])[:40]!r}")
-    if not all(isinstance(part, dict) for part in ours.get("parts", [])):
-        raise ValueError(f"{KEY}.parts are of another kind")
-    if not all(isinstance(version, str) for version in ours.get("versions", {}).values()):
-        raise ValueError(f"{KEY}.versions are of another kind")
 
 
 def exists(dataset_id: str) -> bool:
@@ -169,10 +192,9 @@ def exists(dataset_id: str) -> bool:
     return inside and (root() / dataset_id / "data" / "metadata.json").exists()
 
 
-def provenance(metadata: JsonObject) -> JsonObject:
-    """Return what offbench recorded about a dataset ({} for others' datasets)."""
-    ours = metadata.get(KEY)
-    return ours if isinstance(ours, dict) else {}
+def provenance(metadata: JsonObject) -> Provenance:
+    """Return what offbench recorded about a dataset."""
+    return read_back(Provenance, metadata.get(KEY) or {}, "the metadata", "record or download the dataset again")
 
 
 class ContentHash:

@@ -19,7 +19,7 @@ def warn_other_references(recipe: Recipe, ladder: Ladder) -> None:
     for dataset_id in minari_store.local_ids():
         with contextlib.suppress(OffbenchError):
             ours = minari_store.provenance(minari_store.read_metadata(dataset_id))
-            if ours.get("env") == recipe.name and _scale(ours.get("references", {})) not in (None, wanted):
+            if ours.env == recipe.name and _scale(ours.references) not in (None, wanted):
                 others.append(dataset_id)
     if others:
         warn(

@@ -12,7 +12,7 @@ from offbench.common.terminal import inform
 from offbench.data import minari_store
 from offbench.envs import environments
 from offbench.envs.environments import Env, believed_env
-from offbench.envs.margin_rule import ADDED, EARLIER, MARGIN, SINCE, with_margin
+from offbench.envs.margin_rule import ADDED, EARLIER, SINCE, with_margin
 from offbench.envs.recipes import load_recipe, names
 
 CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d+)(?:\.(\d+))?")  # of a requirement: `>=3.1.0,<3.2.0` has two
@@ -48,8 +48,8 @@ def evaluation_spec(metadata: JsonObject) -> str | None:
 def recorded_margin(metadata: JsonObject) -> str | None:
     """Return the rule for contact margins that a dataset was recorded under; None if its metadata do not tell."""
     ours = minari_store.provenance(metadata)
-    if MARGIN in ours or "versions" in ours:  # recorded by offbench, which kept the earlier rule before it noted it
-        return str(ours.get(MARGIN) or EARLIER)
+    if ours.contact_margin or ours.versions:  # recorded by offbench: its earlier versions had the earlier rule alone
+        return ours.contact_margin or EARLIER
     for operator, major, minor in _demands(metadata):
         version = (int(major), int(minor or 0))
         if operator in ("==", "~=", ">=", ">") and version >= (3, 5):
@@ -72,9 +72,8 @@ def _requirements(metadata: JsonObject) -> list[str]:
 
 def recorded_mujoco(metadata: JsonObject) -> str | None:
     """Return the MuJoCo version a dataset was recorded with: ours, or what a requirement pins; None if unknown."""
-    made = minari_store.provenance(metadata).get("versions")
-    if isinstance(made, dict) and "mujoco" in made:
-        return str(made["mujoco"])
+    if made := minari_store.provenance(metadata).versions.get("mujoco"):
+        return made
     pinned = (re.fullmatch(r"mujoco\s*==\s*([\w.]+)", item) for item in _requirements(metadata))
     return next((match[1] for match in pinned if match), None)
 

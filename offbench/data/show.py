@@ -45,11 +45,11 @@ class Summary:
             lines.append(f"references      random {low:.1f}, expert {high:.1f}: normalized mean return {score:.1f}")
         lines += ["", *_histogram(self.returns), ""]
         lines.append("provenance")
-        for part in ours.get("parts", []):
+        for part in ours.parts or ():
             lines += ["part", *(f"  {key:<13} {fact(value)}" for key, value in part.items())]
-        told = {name: ours.get(name) for name in ("env", "level", "seed", "content_sha256", "recipe_sha256")}
-        told["imported from"] = ours.get("imported", {}).get("file")
-        told["versions"] = ", ".join(f"{name} {version}" for name, version in ours.get("versions", {}).items()) or None
+        told = {name: getattr(ours, name) for name in ("env", "level", "seed", "content_sha256", "recipe_sha256")}
+        told["imported from"] = ours.imported.get("file")
+        told["versions"] = ", ".join(f"{name} {version}" for name, version in ours.versions.items()) or None
         shown = [f"{key:<15} {fact(value)}" for key, value in told.items() if value is not None]
         return lines + (shown or ["not recorded by offbench"])
 

@@ -149,7 +149,7 @@ def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     if cached is None:
         raise OffbenchError(f"cannot read back {folder}; delete it and try again")
     content, arrays = cached[0], dict[str, Any](cached[1])
-    if minari_store.provenance(metadata).get("content_sha256", content) != content:
+    if minari_store.provenance(metadata).content_sha256 not in (None, content):
         raise OffbenchError(
             f"{dataset_id} is damaged: its arrays are not those of the content_sha256 in its metadata; "
             "record or download it again"
@@ -193,7 +193,7 @@ def _key(dataset_id: str, metadata: JsonObject, stamps: Stamps) -> str:
     """Return the cache's name for a dataset: it changes with the content and with the files."""
     folder = minari_store.path_of(dataset_id) / "data"
     sizes_and_times = [(name, size, mtime) for name, (size, mtime, *_) in stamps.items()]
-    content = minari_store.provenance(metadata).get("content_sha256")
+    content = minari_store.provenance(metadata).content_sha256
     text = json.dumps([4, dataset_id, content, str(folder), sizes_and_times])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 

@@ -52,7 +52,7 @@ def _scale(trained: Trained) -> str:
 def _sizes(task: Task) -> list[Cell]:
     """Return transitions, episodes and mean return of a dataset if it is here with the same content."""
     try:
-        recorded = minari_store.provenance(minari_store.read_metadata(task.dataset)).get("content_sha256")
+        recorded = minari_store.provenance(minari_store.read_metadata(task.dataset)).content_sha256
         if recorded not in (None, task.content):
             return [NONE] * 3  # recorded again since: not worth a conversion
         data = transitions.load(task.dataset)

@@ -67,8 +67,8 @@ def _datasets() -> JsonObject:
         except (OffbenchError, KeyError, TypeError, ValueError):
             warn(f"{dataset_id} has damaged metadata")
             continue
-        full = minari_store.provenance(metadata).get("full_size")
-        short = isinstance(full, int) and counts["total_steps"] < full
+        full = minari_store.provenance(metadata).full_size
+        short = full is not None and counts["total_steps"] < full
         more = {"algorithm_name": metadata.get("algorithm_name"), "short_of": full if short else None}
         datasets[dataset_id] = counts | more
     return datasets

@@ -21,6 +21,7 @@ from offbench.common.provenance import made_with
 from offbench.common.settings import fields
 from offbench.common.terminal import inform
 from offbench.data import transitions
+from offbench.data.minari_store import provenance
 from offbench.data.recorded_env import say_margin
 from offbench.data.transitions import Transitions
 from offbench.envs.environments import checked_spec, same_environment
@@ -60,7 +61,7 @@ def check_datasets(datasets: Datasets) -> None:
             checked_spec(data.env_spec, name, data.observations.shape[1], data.low, data.high)
             if data.evaluated_in is None:
                 say_margin(name, data.metadata, data.env_spec)
-            warn_other_physics(name, data.metadata.get("offbench", {}).get("versions", {}), data.env_spec)
+            warn_other_physics(name, provenance(data.metadata).versions, data.env_spec)
         else:
             inform(
                 f"{name} names no environment, so nothing is evaluated during training; "

@@ -145,7 +145,7 @@ def _play(
     exact = made == here
     if made is not None and not exact:
         report.warnings.append(f"recorded with mujoco {made}, installed is {here}: compared within a tolerance")
-    last_unknown = minari_store.provenance(metadata).get("final_observations") == "repeated"
+    last_unknown = minari_store.provenance(metadata).final_observations == "repeated"
     steps = sum(survey.lengths[i] for i in chosen)
     names = [int(data.episode_indices[i]) for i in chosen]
     with Rollouts(spec, workers if workers > 1 and steps > FEW else 0) as rollouts:

@@ -67,7 +67,7 @@ def test_a_level_recorded_at_full_size_has_the_cards_content(level: str, capfd: 
     found = minari_store.provenance(minari_store.read_metadata(f"inverted-pendulum-{level}-v0"))
     same = {name: versions()[name] for name in known["versions"]} == known["versions"]
     assert same, "the tests run with the versions of constraints.txt"
-    assert found["content_sha256"] == known["levels"][level]["content_sha256"][versions()["mujoco"]]
+    assert found.content_sha256 == known["levels"][level]["content_sha256"][versions()["mujoco"]]
     assert "content equal to the dataset card's, bit for bit" in capfd.readouterr().err
 
 

@@ -94,13 +94,14 @@ def test_the_content_hash_is_over_the_arrays(medium: str) -> None:
     for episode in minari.load_dataset(medium).iterate_episodes():
         ends = bool(episode.terminations[-1]), bool(episode.truncations[-1])
         content.add(episode.observations, episode.actions, episode.rewards, ends)
-    assert content.hexdigest() == minari_store.provenance(minari_store.read_metadata(medium))["content_sha256"]
+    assert content.hexdigest() == minari_store.provenance(minari_store.read_metadata(medium)).content_sha256
 
 
 def test_medium_expert_is_medium_then_expert(tiny: tuple[str, str]) -> None:
     recipe, behaviour_dir = tiny
     name = offbench.collect(recipe, "medium-expert", behaviour_dir=behaviour_dir, workers=1, steps=800)
-    parts = minari_store.provenance(minari_store.read_metadata(name))["parts"]
+    parts = minari_store.provenance(minari_store.read_metadata(name)).parts
+    assert parts is not None
     assert [(p["source"], p["transitions"]) for p in parts] == [("medium", 400), ("expert", 400)]
     first = offbench.collect(recipe, "medium", behaviour_dir=behaviour_dir, workers=1, steps=400)
     both, alone = (minari.load_dataset(x) for x in (name, first))
@@ -250,9 +251,7 @@ def test_a_replacement_that_fails_at_the_last_moment_keeps_the_old_dataset(
 
 
 def test_loading_finds_the_recorded_content_hash(medium: str) -> None:
-    assert (
-        offbench.load(medium).content == minari_store.provenance(minari_store.read_metadata(medium))["content_sha256"]
-    )
+    assert offbench.load(medium).content == minari_store.provenance(minari_store.read_metadata(medium)).content_sha256
 
 
 def test_environments_that_reuse_their_array_are_recorded_right() -> None:
