@@ -20,84 +20,59 @@ from typing import TYPE_CHECKING, Any
 from offbench.common.errors import OffbenchError
 
 if TYPE_CHECKING:
-    from offbench.agents.behaviour import behaviour
-    from offbench.analysis.compare import compare
-    from offbench.analysis.normalize import normalize_runs_or_returns as normalize
-    from offbench.benchmarks.benchmark import benchmark
-    from offbench.data.card import card
-    from offbench.data.collect import collect
-    from offbench.data.export import export
-    from offbench.data.huggingface_card import huggingface_card
-    from offbench.data.import_d4rl import import_d4rl
-    from offbench.data.recorded_env import make_env
-    from offbench.data.show import show
-    from offbench.data.transitions import load
-    from offbench.evaluation.evaluate import evaluate
-    from offbench.evaluation.export_policy import export_policy
-    from offbench.evaluation.policies import load_policy
-    from offbench.evaluation.video import video
-    from offbench.reports.report import report
-    from offbench.tools.doctor import doctor
-    from offbench.tools.inventory import inventory
-    from offbench.training.train import train
-    from offbench.verification.verify import verify
+    from offbench.agents.behaviour import behaviour as behaviour
+    from offbench.analysis.compare import compare as compare
+    from offbench.analysis.normalize import normalize as normalize
+    from offbench.benchmarks.benchmark import benchmark as benchmark
+    from offbench.data.card import card as card
+    from offbench.data.collect import collect as collect
+    from offbench.data.export import export as export
+    from offbench.data.huggingface_card import huggingface_card as huggingface_card
+    from offbench.data.import_d4rl import import_d4rl as import_d4rl
+    from offbench.data.recorded_env import make_env as make_env
+    from offbench.data.show import show as show
+    from offbench.data.transitions import load as load
+    from offbench.evaluation.evaluate import evaluate as evaluate
+    from offbench.evaluation.export_policy import export_policy as export_policy
+    from offbench.evaluation.policies import load_policy as load_policy
+    from offbench.evaluation.video import video as video
+    from offbench.reports.report import report as report
+    from offbench.tools.doctor import doctor as doctor
+    from offbench.tools.inventory import inventory as inventory
+    from offbench.training.train import train as train
+    from offbench.verification.verify import verify as verify
 
-__all__ = [
-    "OffbenchError",
-    "behaviour",
-    "benchmark",
-    "card",
-    "collect",
-    "compare",
-    "doctor",
-    "evaluate",
-    "export",
-    "export_policy",
-    "huggingface_card",
-    "import_d4rl",
-    "inventory",
-    "load",
-    "load_policy",
-    "make_env",
-    "normalize",
-    "report",
-    "show",
-    "train",
-    "verify",
-    "video",
-]
-
-# Loaded when first used: `offbench list` must not wait for PyTorch.
-_VERBS = {
-    "behaviour": ("offbench.agents.behaviour", "behaviour"),
-    "benchmark": ("offbench.benchmarks.benchmark", "benchmark"),
-    "card": ("offbench.data.card", "card"),
-    "collect": ("offbench.data.collect", "collect"),
-    "compare": ("offbench.analysis.compare", "compare"),
-    "doctor": ("offbench.tools.doctor", "doctor"),
-    "evaluate": ("offbench.evaluation.evaluate", "evaluate"),
-    "export": ("offbench.data.export", "export"),
-    "export_policy": ("offbench.evaluation.export_policy", "export_policy"),
-    "huggingface_card": ("offbench.data.huggingface_card", "huggingface_card"),
-    "import_d4rl": ("offbench.data.import_d4rl", "import_d4rl"),
-    "inventory": ("offbench.tools.inventory", "inventory"),
-    "load": ("offbench.data.transitions", "load"),
-    "load_policy": ("offbench.evaluation.policies", "load_policy"),
-    "make_env": ("offbench.data.recorded_env", "make_env"),
-    "normalize": ("offbench.analysis.normalize", "normalize_runs_or_returns"),
-    "report": ("offbench.reports.report", "report"),
-    "show": ("offbench.data.show", "show"),
-    "train": ("offbench.training.train", "train"),
-    "verify": ("offbench.verification.verify", "verify"),
-    "video": ("offbench.evaluation.video", "video"),
+# The module of each function, loaded when first used: `offbench list` must not wait for PyTorch.
+_MODULES = {
+    "behaviour": "offbench.agents.behaviour",
+    "benchmark": "offbench.benchmarks.benchmark",
+    "card": "offbench.data.card",
+    "collect": "offbench.data.collect",
+    "compare": "offbench.analysis.compare",
+    "doctor": "offbench.tools.doctor",
+    "evaluate": "offbench.evaluation.evaluate",
+    "export": "offbench.data.export",
+    "export_policy": "offbench.evaluation.export_policy",
+    "huggingface_card": "offbench.data.huggingface_card",
+    "import_d4rl": "offbench.data.import_d4rl",
+    "inventory": "offbench.tools.inventory",
+    "load": "offbench.data.transitions",
+    "load_policy": "offbench.evaluation.policies",
+    "make_env": "offbench.data.recorded_env",
+    "normalize": "offbench.analysis.normalize",
+    "report": "offbench.reports.report",
+    "show": "offbench.data.show",
+    "train": "offbench.training.train",
+    "verify": "offbench.verification.verify",
+    "video": "offbench.evaluation.video",
 }
+__all__ = ["OffbenchError", *_MODULES]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _VERBS:
+    if name not in _MODULES:
         raise AttributeError(f"module 'offbench' has no attribute {name!r}")
-    module, attribute = _VERBS[name]
-    return getattr(importlib.import_module(module), attribute)
+    return getattr(importlib.import_module(_MODULES[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -14,9 +14,9 @@ from offbench.agents.ladder import read_ladder
 from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import Entry, entries_of, read_results
 from offbench.analysis.statistics import iqm
+from offbench.common import scores
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, csv_bytes
-from offbench.common.scores import normalize
 from offbench.common.tables import latex, markdown
 from offbench.common.text import aligned, compact, no_formula
 from offbench.envs.recipes import load_recipe
@@ -111,16 +111,14 @@ def score_returns(env: str, returns: Sequence[float], behaviour_dir: str | Path 
         {
             "environment": recipe.env_id,
             "return": value,
-            "score": normalize(value, *ours) if ours else None,
-            "d4rl_score": normalize(value, *d4rl) if d4rl else None,  # type: ignore[arg-type]
+            "score": scores.normalize(value, *ours) if ours else None,
+            "d4rl_score": scores.normalize(value, *d4rl) if d4rl else None,  # type: ignore[arg-type]
         }
         for value in returns
     ]
 
 
-def normalize_runs_or_returns(
-    runs: str | Path = "runs", *, env: str | None = None, returns: Sequence[float] = ()
-) -> list[Row]:
+def normalize(runs: str | Path = "runs", *, env: str | None = None, returns: Sequence[float] = ()) -> list[Row]:
     """Score all runs below a folder; or, with `env`, score `returns` of that environment.
 
     Rows are dictionaries; `offbench.analysis.normalize.render(rows, "markdown")` prints them.
