@@ -6,9 +6,13 @@ import sys
 import time
 from collections.abc import Iterator
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING
 
 from offbench.common.terminal import console, is_terminal
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.progress import Progress as Bar
 
 PLAIN_INTERVAL = 30.0  # seconds between two plain lines without news
 REFRESH_INTERVAL = 0.1  # seconds between two pictures of the bar
@@ -29,18 +33,18 @@ class Progress:
         self._first_work: float = start
         self._first, self._note, self._printed = start, "", -1
         self._began = self._last = time.monotonic()
-        self._bar: Any = None
+        self._bar: Bar | None = None
         if is_terminal(sys.stderr):
-            self._bar = _bar()
-            self._task = self._bar.add_task(what, total=total, completed=start, details=self._details(), note="")
-            self._bar.start()
+            self._bar = bar = _bar()
+            self._task = bar.add_task(what, total=total, completed=start, details=self._details(bar), note="")
+            bar.start()
 
     def __enter__(self) -> Progress:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, _: object, __: TracebackType | None) -> None:
         if self._bar is not None:
-            self._update()
+            self._update(self._bar)
             self._bar.stop()
         elif kind is None and self.done > self._first and self._printed != self.done:
             self._print()
@@ -67,13 +71,13 @@ class Progress:
         waited = time.monotonic() - self._last
         if self._bar is not None:
             if waited >= REFRESH_INTERVAL:
-                self._update()
+                self._update(self._bar)
         elif news or waited > PLAIN_INTERVAL:
             self._print()
 
-    def _update(self) -> None:
+    def _update(self, bar: Bar) -> None:
         self._last = time.monotonic()
-        self._bar.update(self._task, completed=self.done, details=self._details(), note=self._note, refresh=True)
+        bar.update(self._task, completed=self.done, details=self._details(bar), note=self._note, refresh=True)
 
     def _rate(self) -> float:
         return (self.done - self._first) / max(time.monotonic() - self._began, 1e-9)
@@ -83,11 +87,11 @@ class Progress:
         left = (self._work - self._worked) * (time.monotonic() - self._began) / worked if worked else float("inf")
         return f"{duration(left)} left"
 
-    def _details(self) -> str:
+    def _details(self, bar: Bar) -> str:
         """Return what stands beside the bar. A narrow terminal leaves out the rate."""
         done, rate, left = f"{self.done:,}/{self.total:,}", f"{self._rate():,.0f} steps/s", self._left()
         details = f"{done}, {rate}, {left}"
-        room = self._bar.console.width - len(self.what) - NARROWEST_BAR
+        room = bar.console.width - len(self.what) - NARROWEST_BAR
         return details if len(details) <= room else f"{done}, {left}"
 
     def _print(self) -> None:
@@ -96,13 +100,13 @@ class Progress:
         print(", ".join(filter(None, [*parts, self._note])), file=sys.stderr, flush=True)
 
 
-def _bar() -> Any:
+def _bar() -> Bar:
     """Return rich's bar for one task: title, bar, percent and details, and the task's note on a line below."""
     from rich import progress
     from rich.text import Text
 
-    class Bar(progress.Progress):
-        def get_renderables(self) -> Iterator[Any]:
+    class NoteBar(progress.Progress):
+        def get_renderables(self) -> Iterator[RenderableType]:
             yield self.make_tasks_table(self.tasks)
             for task in self.tasks:
                 if task.fields["note"]:
@@ -114,7 +118,7 @@ def _bar() -> Any:
         progress.TaskProgressColumn(),
         progress.TextColumn("{task.fields[details]}", style="dim", markup=False),
     ]
-    return Bar(*columns, console=console(sys.stderr), auto_refresh=False, expand=True)
+    return NoteBar(*columns, console=console(sys.stderr), auto_refresh=False, expand=True)
 
 
 def duration(seconds: float) -> str:

@@ -39,13 +39,12 @@ def console(stream: TextIO) -> Console:
     return Console(file=raw, color_system=None if plain else "auto", highlight=False, markup=False, emoji=False)
 
 
-def say(line: str, style: str = "", *, stream: TextIO | None = None) -> None:
-    """Print a line to stdout (or another stream), styled on a terminal."""
-    stream = stream or sys.stdout
-    if is_terminal(stream):
-        console(stream).print(printable(line), style=style or None)
+def say(line: str, style: str = "") -> None:
+    """Print a line to stdout, styled on a terminal."""
+    if is_terminal(sys.stdout):
+        console(sys.stdout).print(printable(line), style=style or None)
     else:
-        print(line, file=stream, flush=True)
+        print(line, flush=True)
 
 
 def labeled(label: str, text: str, style: str, *, wrap: bool = True) -> None:
