@@ -195,10 +195,6 @@ class _Recording:
         with Rollouts(self.spec, self.workers if self.workers > 1 else 0) as rollouts:
             return {"random": random_reference(self.recipe, 0, rollouts)}
 
-    def full_size(self, parts: tuple[Part, ...]) -> int:
-        """Return the transitions of a dataset of these parts at its full size."""
-        return _full_size(self.recipe, self._ladder, parts)
-
     def source(self, part: Part, accept: bool) -> Rung | None:
         """Return the rung a part is played by, or None for uniform actions and the replay.
 
@@ -328,7 +324,7 @@ def _metadata(
     """Return Minari's metadata, all of it, and ours under one key."""
     recipe, references, made = recording.recipe, recording.references, versions()
     described = [recording.describe(*item) for item in zip(parts, sources, counts, strict=True)]
-    full, total = recording.full_size(parts), sum(counts)
+    full, total = _full_size(recipe, recording._ladder, parts), sum(counts)
     short = f" A short recording: {total:,} of {full:,} transitions." if total < full else ""
     words = [recording.words(part, rung) for part, rung in zip(parts, sources, strict=True)]
     return {

@@ -29,7 +29,6 @@ LEVELS: dict[str, tuple[Part, ...]] = {  # in order of their mean return
     "medium-expert": (Part("medium"), Part("expert")),
     "expert": (Part("expert"),),
 }
-SINGLE = {name: parts[0].source for name, parts in LEVELS.items() if len(parts) == 1}
 
 
 def parse_level(text: str) -> tuple[str, tuple[Part, ...]]:
@@ -60,16 +59,11 @@ def parse_mix(text: str) -> tuple[str, tuple[Part, ...]]:
         weight = _number(share)
         if weight is None or not 0 < weight <= 1:
             raise OffbenchError(f"--mix takes LEVEL:SHARE,LEVEL:SHARE with shares in (0, 1], not {item.strip()!r}")
-        source = SINGLE.get(level)
-        if source is None:
-            name, (part, *rest) = parse_level(level)
-            if rest:
-                raise OffbenchError(f"--mix takes single levels; write {level} as its parts")
-            source = part.source
-        else:
-            name = level
+        name, (part, *rest) = parse_level(level)
+        if rest:
+            raise OffbenchError(f"--mix takes single levels; write {level} as its parts")
         names.append(f"{name}{_percent(weight)}")
-        parts.append(Part(source, weight))
+        parts.append(Part(part.source, weight))
     total = sum(part.weight for part in parts)
     if not math.isclose(total, 1, abs_tol=1e-6):
         raise OffbenchError(f"the shares of --mix must add up to 1, not {total:g}")

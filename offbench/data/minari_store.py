@@ -219,7 +219,7 @@ def being_recorded(dataset_id: str) -> bool:
     """Whether another process holds a dataset id for writing."""
     path = path_of(dataset_id)
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(_lock_path(path))
+    lock = FileLock(_beside(path, "lock"))
     try:
         lock.acquire(timeout=0)
     except Timeout:
@@ -228,8 +228,9 @@ def being_recorded(dataset_id: str) -> bool:
     return False
 
 
-def _lock_path(path: Path) -> Path:
-    return path.parent / f".offbench-{path.name}.lock"
+def _beside(path: Path, ending: str) -> Path:
+    """Return a hidden path beside a dataset: its `lock`, `partial` while it is written, `old` while it is replaced."""
+    return path.with_name(f".offbench-{path.name}.{ending}")
 
 
 @contextlib.contextmanager
@@ -243,7 +244,7 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     path = path_of(dataset_id)
     if not path.parent.resolve().is_relative_to(root().resolve()):
         raise OffbenchError(f"{dataset_id} leads out of {root()} by a link; choose another id")
-    with exclusive_lock(_lock_path(path), f"{dataset_id} is being recorded"):
+    with exclusive_lock(_beside(path, "lock"), f"{dataset_id} is being recorded"):
         with disk_errors(str(path)):
             _recover(path)
         if path.exists() and not overwrite:
@@ -265,7 +266,7 @@ def tidy(dataset_id: str) -> None:
     path = path_of(dataset_id)
     with (
         contextlib.suppress(OffbenchError),
-        exclusive_lock(_lock_path(path), dataset_id, timeout=0),
+        exclusive_lock(_beside(path, "lock"), dataset_id, timeout=0),
         disk_errors(str(path)),
     ):
         _recover(path)
@@ -291,7 +292,7 @@ def write(
         expected: the content hash that the data must have (None: any).
     """
     env_spec = EnvSpec.from_json(without_margin(spec)[0]) if spec else None
-    aside = _partial(path)
+    aside = _beside(path, "partial")
     with disk_errors(str(path)):
         (aside / "data").mkdir(parents=True)
         try:
@@ -312,7 +313,7 @@ def write(
             storage.update_metadata(metadata | {KEY: ours})
             _write_namespaces(path)
             if path.exists():
-                path.replace(_old(path))
+                path.replace(_beside(path, "old"))
             aside.replace(path)
         except Exception as error:  # Minari raises a ValueError for a missing folder, for example
             if aside.exists():
@@ -331,24 +332,14 @@ def _write_namespaces(path: Path) -> None:
             file.write_text("{}", encoding="utf-8")
 
 
-def _old(path: Path) -> Path:
-    """Return where the dataset that is being replaced waits for a moment."""
-    return path.with_name(f".offbench-{path.name}.old")
-
-
-def _partial(path: Path) -> Path:
-    """Return where the dataset is written until it is whole."""
-    return path.with_name(f".offbench-{path.name}.partial")
-
-
 def _recover(path: Path) -> None:
     """Put the replaced dataset back if the new one did not make it, else delete it; delete what is half written."""
-    old = _old(path)
+    old = _beside(path, "old")
     if old.exists() and not path.exists():
         old.replace(path)
     if old.is_symlink():
         old.unlink()  # never what it leads to
-    for left in (old, _partial(path)):
+    for left in (old, _beside(path, "partial")):
         shutil.rmtree(left, ignore_errors=True)
 
 

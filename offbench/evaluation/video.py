@@ -23,7 +23,7 @@ from offbench.common import seeds
 from offbench.common.errors import OffbenchError
 from offbench.common.files import disk_errors, output_file, write_bytes
 from offbench.common.seeds import Purpose
-from offbench.data.levels import SINGLE, parse_level
+from offbench.data.levels import parse_level
 from offbench.envs.environments import Env, make_env, spaces_of, time_limit
 from offbench.envs.recipes import load_recipe
 from offbench.evaluation.evaluate import open_policy
@@ -96,12 +96,12 @@ def _policy_of(path: str, env: str | None) -> tuple[Policy, str, bool]:
         policy, _, spec = open_policy(Path(path), env)
         return policy, spec, policy.kind == "uniform"
     recipe = load_recipe(name)
-    source = SINGLE.get(level) or parse_level(level)[1][0].source
+    source, *more = (part.source for part in parse_level(level)[1])
     spec = recipe.env_spec()
     if source == "uniform":
         observations, actions = spaces_of(make_env(spec), recipe.env_id)
         return uniform(actions.low, actions.high, observations.shape[0], recipe.env_id), spec, True
-    if source == "replay" or level == "medium-expert":
+    if source == "replay" or more:
         raise OffbenchError(f"{level} is not of one policy; choose random, medium, expert or a fraction")
     ladder = find_ladder(recipe)
     if ladder is None:
