@@ -201,10 +201,13 @@ class Results:
         """Return a method's entries in order of tasks."""
         return [self.entries[task, method] for task in self.tasks if (task, method) in self.entries]
 
+    def on(self, task: Task) -> list[Entry]:
+        """Return a task's entries in order of methods."""
+        return [self.entries[task, method] for method in self.methods if (task, method) in self.entries]
+
     def comparable(self, task: Task) -> bool:
         """Return whether all scores of a task are of evaluations at the same steps: others must not be ranked."""
-        runs = [trained for (of, _), entry in self.entries.items() if of == task for trained in entry.runs]
-        return len({trained.window for trained in runs}) == 1
+        return len({trained.window for entry in self.on(task) for trained in entry.runs}) == 1
 
     def method(self, name: str) -> Method:
         """Return the method of a name: as a table has it, ALGO/VARIANT, or ALGO for its default or only variant.

@@ -40,7 +40,7 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
         if waiting:
             note(f"{counted(waiting, 'run')} without an evaluation yet")
         if plot:
-            from offbench.reports.normalize_plot import plot_curves
+            from offbench.reports.figures import plot_curves
 
             print(f"saved {plot_curves(arguments['runs'], plot)}", file=sys.stderr)
 

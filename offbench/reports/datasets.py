@@ -23,7 +23,7 @@ def dataset_table(results: Results) -> Table:
     """Return the datasets that the runs were trained on, as their config.json names them."""
     rows = []
     for task in results.tasks:
-        runs = [trained for (key, _), entry in results.entries.items() if key == task for trained in entry.runs]
+        runs = [trained for entry in results.on(task) for trained in entry.runs]
         envs = sorted({trained.config.env_id for trained in runs} - {""})
         rows.append(
             [

@@ -11,20 +11,23 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from offbench.analysis.methods import Method
-from offbench.analysis.results import REFERENCES, Entry, Results, Task
+from offbench.analysis.results import REFERENCES, Entry, Results, Task, read_results
 from offbench.analysis.statistics import Estimate, Scores, curve, iqm, profile
 from offbench.common.arrays import Array
+from offbench.common.plotting import figure, picture_file, save
 from offbench.common.scores import LAST
 from offbench.common.text import compact
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
+    from matplotlib.lines import Line2D
     from matplotlib.typing import LineStyleType
 
 INK = "#21252b"  # text and axes; the page replaces it by its own text color
@@ -76,16 +79,10 @@ def lines(methods: Sequence[Method]) -> dict[Method, Line]:
 def curve_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str) -> Figure:
     """Draw one task's learning curves: mean over seeds with its 95% interval (the paper's Figure 4)."""
     task = entries[0].task
-    ends = []
+    ends: list[str] = []
 
     def paint(axes: Axes) -> None:
-        for entry in entries:
-            steps, values = entry.drawn_curve()
-            if steps:
-                points = curve(values)
-                _band(axes, steps, points, looks[entry.method])
-                ends.append(f"{entry.method.label} {points[-1].value:.1f}")
-        axes.set(xlabel="updates", ylabel=_unit(task), title=shortened(task.name, 44))
+        ends.extend(_paint_curves(axes, entries, looks))
 
     def alt() -> str:
         return f"Learning curves on {task.name}. At the last common evaluation: {', '.join(dict.fromkeys(ends))}."
@@ -94,6 +91,38 @@ def curve_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
     if any(entry.smoothed for entry in entries):
         caption += f" Each point is the mean of the last {LAST} evaluations up to it."
     return _draw(name, caption, alt, paint, [looks[entry.method] for entry in entries])
+
+
+def _paint_curves(axes: Axes, entries: Sequence[Entry], looks: Mapping[Method, Line]) -> list[str]:
+    """Draw one task's learning curves; return each method with its last score."""
+    ends = []
+    for entry in entries:
+        steps, values = entry.drawn_curve()
+        if steps:
+            points = curve(values)
+            _band(axes, steps, points, looks[entry.method])
+            ends.append(f"{entry.method.label} {points[-1].value:.1f}")
+    axes.set(xlabel="updates", ylabel=_unit(entries[0].task), title=shortened(entries[0].task.name, 44))
+    return ends
+
+
+def plot_curves(runs: str | Path, path: str | Path) -> Path:
+    """Draw the learning curves of all runs below a folder as one picture, a panel for each dataset.
+
+    Raises:
+        OffbenchError: there are no evaluated runs, or the picture cannot be written.
+    """
+    import matplotlib as mpl
+
+    path = picture_file(path)
+    results = read_results(runs)
+    looks = lines(results.methods)
+    with mpl.rc_context(_style(path.stem)), figure(len(results.tasks)) as (fig, panels):
+        for axes, task in zip(panels, results.tasks, strict=True):
+            entries = results.on(task)
+            _paint_curves(axes, entries, looks)
+            axes.legend(*_legend([looks[entry.method] for entry in entries]), frameon=False, fontsize="small")
+        return save(fig, path)
 
 
 def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str) -> Figure:
@@ -257,15 +286,8 @@ def _draw(
 ) -> Figure:
     """Draw a figure and keep it three ways. `alt` may be a function, called after the painting."""
     import matplotlib as mpl
-    from matplotlib.lines import Line2D
 
-    from offbench.common.plotting import figure
-
-    # names may hold $ and are not formulas; ids in the SVG must be the same on every run
-    style: Any = {"text.parse_math": False, "svg.fonttype": "none", "svg.hashsalt": name, "axes.labelcolor": INK}
-    style |= {"text.color": INK, "axes.edgecolor": GRID, "xtick.color": INK, "ytick.color": INK, "font.size": 9}
-    style |= {"axes.titlesize": 10, "axes.grid": True, "grid.color": GRID, "grid.alpha": 0.25, "grid.linewidth": 0.6}
-    with mpl.rc_context(style), figure() as (fig, (axes,)):
+    with mpl.rc_context(_style(name)), figure() as (fig, (axes,)):
         fig.set_size_inches(*SIZE)
         fig.patch.set_alpha(0)
         axes.patch.set_alpha(0)
@@ -276,12 +298,26 @@ def _draw(
         inline = _saved(fig, "svg").decode()
         fig.patch.set_alpha(1)
         if legend:
-            handles = [Line2D([], [], color=look.color, linestyle=look.style) for look in legend]
-            names = [f" {shortened(look.label, 32)}" for look in legend]  # matplotlib hides labels that begin with _
             fig.set_size_inches(SIZE[0], SIZE[1] + 0.2 * ((len(legend) + 1) // 2))
-            fig.legend(handles, names, loc="outside lower center", ncols=2, frameon=False, fontsize="small")
+            fig.legend(*_legend(legend), loc="outside lower center", ncols=2, frameon=False, fontsize="small")
         png, svg = _saved(fig, "png"), _saved(fig, "svg")
     return Figure(name, caption, alt() if callable(alt) else alt, png, svg, _for_page(inline, name), tuple(legend))
+
+
+def _style(name: str) -> Any:
+    """Return matplotlib's settings: a $ in a name is no formula, and the ids in an SVG are always the same."""
+    style = {"text.parse_math": False, "svg.fonttype": "none", "svg.hashsalt": name, "axes.labelcolor": INK}
+    style |= {"text.color": INK, "axes.edgecolor": GRID, "xtick.color": INK, "ytick.color": INK, "font.size": 9}
+    grid = {"axes.grid": True, "grid.color": GRID, "grid.alpha": 0.25, "grid.linewidth": 0.6}
+    return style | grid | {"axes.titlesize": 10}
+
+
+def _legend(looks: Sequence[Line]) -> tuple[list[Line2D], list[str]]:
+    """Return the lines and names of a legend."""
+    from matplotlib.lines import Line2D
+
+    names = [f" {shortened(look.label, 32)}" for look in looks]  # matplotlib hides labels that begin with _
+    return [Line2D([], [], color=look.color, linestyle=look.style) for look in looks], names
 
 
 def _saved(fig: Canvas, kind: str) -> bytes:

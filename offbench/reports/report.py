@@ -105,9 +105,7 @@ def _tables(results: Results) -> dict[str, Table]:
 def _figures(results: Results) -> dict[str, list[Figure]]:
     """Return all figures by what they show."""
     looks = draw.lines(results.methods)
-    rows = [
-        [results.entries[task, m] for m in results.methods if (task, m) in results.entries] for task in results.tasks
-    ]
+    rows = [results.on(task) for task in results.tasks]
     stems = _stems([entries[0].task.name for entries in rows])
     groups: dict[str, list[Figure]] = {"curves": [], "finals": [], "beta": [], "q": [], "iqm": []}
     for entries, stem in zip(rows, stems, strict=True):

@@ -21,7 +21,7 @@ def best_table(results: Results) -> Table | None:
     for task in results.tasks:
         cells = []
         for algorithm in algorithms:
-            entries = [e for e in results.entries.values() if e.task == task and e.method.algorithm == algorithm]
+            entries = [entry for entry in results.on(task) if entry.method.algorithm == algorithm]
             if not entries or len({entry.window for entry in entries}) > 1 or entries[0].window is None:
                 cells.append(NONE)
                 continue

@@ -18,7 +18,7 @@ from offbench.analysis.normalize import FORMATS, render
 from offbench.cli.main import main
 from offbench.common.scores import interval, mean_std, normalize, run_return
 from offbench.envs.recipes import d4rl_reference
-from offbench.reports.normalize_plot import plot_curves
+from offbench.reports.figures import plot_curves
 from offbench.training.run import Run, RunConfig
 
 

@@ -17,7 +17,7 @@ import offbench
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.data import minari_store
-from offbench.reports.normalize_plot import plot_curves
+from offbench.reports.figures import plot_curves
 from tests.conftest import TINY_RECIPE
 from tests.data.test_transitions import episode, foreign
 
