@@ -93,7 +93,7 @@ def load_grid(name: str) -> Grid:
     path = Path(name) if own else grids() / f"{name}.toml"
     if not own and name not in shipped_grids():
         raise unknown("grid", name, shipped_grids())
-    where = f"{path.name}"
+    where = path.name
     try:
         with damage(where, "is not a readable TOML file", "correct it, or give another"):
             values = tomllib.loads(read_text(path))

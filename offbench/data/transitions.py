@@ -103,14 +103,13 @@ class Transitions:
     def normalizer(self) -> tuple[Array, Array]:
         """Return mean and std + 1e-3 of the transitions' observations, [obs] float32, as TD3+BC's authors do."""
         count, dim = len(self), self.observations.shape[1]
-        total, square = np.zeros(dim), np.zeros(dim)
-        for first in range(0, count, 100_000):
-            part = self.observations[self.rows[first : first + 100_000]].astype(np.float64)
-            total += part.sum(0)
-        mean = total / count
-        for first in range(0, count, 100_000):
-            part = self.observations[self.rows[first : first + 100_000]].astype(np.float64)
-            square += ((part - mean) ** 2).sum(0)
+
+        def blocks() -> Iterator[Array]:
+            for first in range(0, count, 100_000):
+                yield self.observations[self.rows[first : first + 100_000]].astype(np.float64)
+
+        mean = sum((block.sum(0) for block in blocks()), np.zeros(dim)) / count
+        square = sum((((block - mean) ** 2).sum(0) for block in blocks()), np.zeros(dim))
         return mean.astype(np.float32), (np.sqrt(square / count) + 1e-3).astype(np.float32)
 
 
