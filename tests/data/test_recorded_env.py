@@ -128,7 +128,7 @@ def test_where_no_version_is_recorded_verify_finds_the_margins(capsys: pytest.Ca
         ({"requirements": "mujoco==4.0.0"}, None),
         ({"offbench": {"versions": {"mujoco": "4.0.0"}}}, EARLIER),
         ({"offbench": {"contact_margin": "sum", "versions": {"mujoco": "3.4.0"}}}, ADDED),
-        ({"offbench": {"contact_margin": None, "versions": {}}}, EARLIER),
+        ({"offbench": {"contact_margin": None, "versions": {"mujoco": "4.0.0"}}}, EARLIER),
         ({"offbench": {"imported": {}}, "requirements": ["mujoco==4.0.0"]}, ADDED),
     ],
 )

@@ -81,7 +81,7 @@ def whole(name: str) -> str:
     content = minari_store.ContentHash()
     for e in episodes_of(open_minari(name)):
         content.add(e.observations, e.actions, e.rewards, (bool(e.terminations[-1]), bool(e.truncations[-1])))
-    assert content.hexdigest() == minari_store.provenance(minari_store.read_metadata(name))["content_sha256"]
+    assert content.hexdigest() == minari_store.provenance(minari_store.read_metadata(name)).content_sha256
     return content.hexdigest()
 
 

@@ -131,7 +131,7 @@ def test_swapped_medium_and_expert() -> None:
     for name in names:
         assert codes(tamper(name, lambda _: None)) >= {"wrong-level"}
     both = offbench.collect("inverted-pendulum", "medium-expert", steps=40_000, workers=1)
-    parts = minari_store.provenance(minari_store.read_metadata(both))["parts"]
+    parts = minari_store.provenance(minari_store.read_metadata(both)).parts
     change_metadata(both, parts=parts[::-1])
     assert codes(both) >= {"wrong-level", "metadata"}
 
