@@ -51,8 +51,8 @@ def test_a_file_without_timeouts_is_cut_at_its_environments_limit(home: Path, rn
     import_d4rl(home / "local.hdf5", "p-v0", env="p300.toml")
     assert lengths("p-v0") == [299, 150, 299, 299, 299, 149]  # of 300, 150, 300, 300, 300, 150 rows
     theirs = qlearning(columns, limit=300)
-    ours = np.load(export("p-v0", home / "out.npz", drop_timeouts=True), allow_pickle=False)
-    np.testing.assert_array_equal(ours["observations"], theirs["observations"])
+    with np.load(export("p-v0", home / "out.npz", drop_timeouts=True), allow_pickle=False) as ours:
+        np.testing.assert_array_equal(ours["observations"], theirs["observations"])
 
 
 def test_without_a_limit_or_timeouts_nothing_can_be_cut(
