@@ -254,7 +254,7 @@ def _forget(source: str) -> None:
     """Delete what was converted from an earlier content of the same dataset."""
     for meta in cache().glob("*/meta.json"):
         try:
-            superseded = json.loads(meta.read_text()).get("source") == source
+            superseded = json.loads(read_text(meta)).get("source") == source
         except (OSError, ValueError, AttributeError):
             continue
         if superseded:

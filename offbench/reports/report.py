@@ -16,7 +16,7 @@ from pathlib import Path
 
 from offbench.analysis.results import Folders, Results, read_results
 from offbench.common.errors import OffbenchError
-from offbench.common.files import write_together
+from offbench.common.files import damage, read_bytes, write_together
 from offbench.common.tables import Table, files
 from offbench.common.text import counted, plural
 from offbench.reports import figures as draw
@@ -80,10 +80,12 @@ def _older(folder: Path) -> set[Path]:
     if folder.exists() and not folder.is_dir():
         raise OffbenchError(f"{folder} is a file; give another --out")
     page = folder / PAGE
-    if not page.exists():
+    try:
+        with damage(str(page), "is not a report of offbench", "give another --out"):
+            if GENERATOR.encode() not in read_bytes(page):
+                raise ValueError("it does not say so")
+    except FileNotFoundError:
         return set()
-    if GENERATOR not in page.read_text(encoding="utf-8", errors="replace"):
-        raise OffbenchError(f"{page} is not a report of offbench; give another --out")
     return {
         path
         for kind in ("tables/*.csv", "tables/*.md", "tables/*.tex", "figures/*.png", "figures/*.svg")

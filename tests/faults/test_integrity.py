@@ -192,6 +192,25 @@ def test_a_fifo_is_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         assert "not a regular file" in line
 
 
+@pytest.mark.parametrize("kind", ["fifo", "/dev/full", "/dev/zero", "folder"])
+def test_a_report_is_not_written_over_what_is_no_file(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An older page is read, to see whether offbench wrote it; a device would never end."""
+    trained(tmp_path / "runs" / "seed-0")
+    page = tmp_path / "report" / "index.html"
+    page.parent.mkdir()
+    if kind == "fifo":
+        os.mkfifo(page)
+    elif kind == "folder":
+        page.mkdir()
+    else:
+        page.symlink_to(kind)
+    line = refusal(["report", "--runs", str(tmp_path / "runs"), "--out", str(page.parent)], capsys)
+    assert f"{page} is not a report of offbench" in line
+    assert list(page.parent.iterdir()) == [page]
+
+
 def offbench(*words: str, before: str = "", **how: str) -> subprocess.CompletedProcess[str]:
     command = f'{before} exec "$0" -m offbench "$@"'
     environment = os.environ | how
