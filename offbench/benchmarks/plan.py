@@ -19,7 +19,7 @@ from offbench.common.text import counted
 from offbench.data import minari_store
 from offbench.data.levels import full_size, parse_level
 from offbench.data.recorded_env import evaluation_spec
-from offbench.envs.environments import believed_env, make_env, spaces_of
+from offbench.envs.environments import make_env, spaces_of, untrusted_env
 from offbench.envs.recipes import load_recipe
 from offbench.training.devices import Machine, pick_machine
 from offbench.training.run import Run
@@ -176,7 +176,7 @@ def _recorded_env_spec(source: Source) -> str:
     spec = evaluation_spec(minari_store.read_metadata(source.id))
     if spec is None:
         raise OffbenchError(f"{source.id} names no environment: give one to evaluate in with --env RECIPE")
-    believed_env(spec, source.id).close()
+    untrusted_env(spec, source.id).close()
     return spec
 
 

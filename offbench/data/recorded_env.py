@@ -11,7 +11,7 @@ from offbench.common.provenance import versions
 from offbench.common.terminal import inform
 from offbench.data import minari_store
 from offbench.envs import environments
-from offbench.envs.environments import Env, believed_env
+from offbench.envs.environments import Env, untrusted_env
 from offbench.envs.margin_rule import ADDED, EARLIER, SINCE, with_margin
 from offbench.envs.recipes import load_recipe, names
 
@@ -34,7 +34,7 @@ def make_env(name: str, render_mode: str | None = None) -> Env:
     spec = evaluation_spec(metadata)
     if spec is None:
         raise OffbenchError(f"{name} names no environment; give the name or the file of a recipe instead")
-    believed_env(spec, name).close()
+    untrusted_env(spec, name).close()
     say_margin(name, metadata, spec)
     return environments.make_env(spec, render_mode)
 

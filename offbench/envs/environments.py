@@ -1,8 +1,8 @@
 """Environments: made from a recipe's id, or from the EnvSpec that a dataset or a run carries.
 
-An EnvSpec names the code that makes the environment, so one that came in a file is checked before it is believed.
+An EnvSpec names the code that makes the environment, so one that came in a file is checked before it is used.
 
-The EnvSpecs that offbench passes around, and keeps in runs, may have a field that Gymnasium's have not,
+The EnvSpecs that offbench passes around, and keeps in runs, may have a field that Gymnasium's do not have,
 `contact_margin`: "sum" is the rule of MuJoCo 3.5 and later, "max", the default, that of earlier versions
 (offbench.envs.contact_margins). Minari's metadata get the plain EnvSpec.
 """
@@ -29,11 +29,11 @@ from offbench.envs.trust import check_code
 
 Env: TypeAlias = gym.Env[Array, Array]
 Space: TypeAlias = gym.Space[Any]
-WHAT_MATTERS = ("id", "kwargs", "max_episode_steps")  # with the contact margins, what makes two specs the same
+IDENTITY = ("id", "kwargs", "max_episode_steps")  # specs that agree in these and in the contact margins are the same
 LARGEST_BOUND = 1e6  # of actions; what has larger ones, such as float32's largest number, has none
 LONGEST = 20_000  # steps that an episode may take in an environment without a time limit
 LARGEST_LIMIT = 1_000_000  # a time limit beyond this is none
-ELSEWHERE = "give the right environment with --env RECIPE"
+OTHER_ENV = "give the right environment with --env RECIPE"
 
 
 def env_spec(env_id: str, **kwargs: Any) -> str:
@@ -69,20 +69,20 @@ def checked_spec(text: str, where: str, observation_dim: int, low: Array, high: 
     Raises:
         OffbenchError: it names code that is no Gymnasium environment, cannot be made, or has other shapes.
     """
-    with contextlib.suppress(Exception):  # whatever is wrong with it, believed_env reports
+    with contextlib.suppress(Exception):  # untrusted_env reports what is wrong with it
         spec = EnvSpec.from_json(without_margin(text)[0])
         _warn_endless(spec.id, spec)
     try:
-        env = believed_env(text, where)
+        env = untrusted_env(text, where)
         observations, actions = spaces_of(env, where)
     except OffbenchError as error:
-        raise OffbenchError(f"{error}; to evaluate in another environment, {ELSEWHERE}") from error
+        raise OffbenchError(f"{error}; to evaluate in another environment, {OTHER_ENV}") from error
     name = env.spec.id if env.spec else "?"
     shapes = (observations.shape, actions.shape)
     if shapes != ((observation_dim,), low.shape):
         raise OffbenchError(
             f"{where} has observations ({observation_dim},) and actions {low.shape}; the environment {name} has "
-            f"{shapes[0]} and {shapes[1]}: {ELSEWHERE}"
+            f"{shapes[0]} and {shapes[1]}: {OTHER_ENV}"
         )
     if not same_bounds(actions, low, high):
         warn(
@@ -103,7 +103,7 @@ def _bounds(low: Array, high: Array) -> str:
     return ", ".join(f"[{a:g}, {b:g}]" for a, b in zip(low.flat, high.flat, strict=True))
 
 
-def believed_env(text: str, where: str) -> Env:
+def untrusted_env(text: str, where: str) -> Env:
     """Make the environment of an EnvSpec (JSON) that came in a file, if what it names is an environment.
 
     Raises:
@@ -173,15 +173,15 @@ def make_env(spec: str, render_mode: str | None = None) -> Env:
 
         if (model := model_of(env)) is not None:
             set_contacts(model, rule, made.id)
-    _ask_once(env.unwrapped)
+    _cache_health(env.unwrapped)
     return env
 
 
 @contextlib.contextmanager
 def _quiet_loading(env_id: str) -> Iterator[None]:
-    """Say nothing of what MuJoCo finds deprecated in Gymnasium's own models, such as HalfCheetah's `settotalmass`.
+    """Suppress MuJoCo's warnings of deprecated elements in Gymnasium's models, such as HalfCheetah's `settotalmass`.
 
-    MuJoCo would print it and write MUJOCO_LOG.TXT into the working directory, for each environment that is made.
+    MuJoCo would print them and write MUJOCO_LOG.TXT into the working directory, for each environment that is made.
     """
     registered = gym.registry.get(env_id)
     if registered is None or not str(registered.entry_point).startswith("gymnasium.envs.mujoco."):
@@ -202,16 +202,16 @@ def _say_unless_deprecated(warning: str) -> None:
         warn(f"MuJoCo: {warning.strip()}")
 
 
-def _ask_once(env: Env) -> None:
-    """Let a task of Gymnasium's own work out once a step whether it is healthy.
+def _cache_health(env: Env) -> None:
+    """Compute `is_healthy` of Gymnasium's own tasks once per step.
 
-    Its step asks twice, for the reward and for the end, and each time costs a tenth of the step.
+    Their step reads it twice, for the reward and for the termination, and each time takes a tenth of the step.
     """
     kind: Any = type(env)
     if not (kind.__module__.startswith("gymnasium.envs.mujoco.") and hasattr(kind, "is_healthy")):
         return
 
-    class AskedOnce(kind):  # type: ignore[misc]
+    class CachedHealth(kind):  # type: ignore[misc]
         _healthy: bool | None = None
 
         @property
@@ -228,7 +228,7 @@ def _ask_once(env: Env) -> None:
             super().set_state(*arguments)
             self._healthy = None
 
-    env.__class__ = AskedOnce
+    env.__class__ = CachedHealth
 
 
 def same_environment(a: str | None, b: str | None) -> bool:
@@ -236,7 +236,7 @@ def same_environment(a: str | None, b: str | None) -> bool:
     if a is None or b is None:
         return a is b
     first, second = json.loads(a), json.loads(b)
-    same = all(first.get(key) == second.get(key) for key in WHAT_MATTERS)
+    same = all(first.get(key) == second.get(key) for key in IDENTITY)
     return same and first.get(MARGIN, EARLIER) == second.get(MARGIN, EARLIER)
 
 

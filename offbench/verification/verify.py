@@ -25,7 +25,7 @@ from offbench.data import minari_store
 from offbench.data.file_stamps import unchanged
 from offbench.data.minari_reader import Recorded, episodes_of, reading
 from offbench.data.recorded_env import margins_matter, recorded_margin, recorded_mujoco
-from offbench.envs.environments import believed_env, box, same_bounds
+from offbench.envs.environments import box, same_bounds, untrusted_env
 from offbench.envs.margin_rule import ADDED, EARLIER, SINCE, with_margin
 from offbench.rollouts.rollouts import Rollouts, result
 from offbench.verification.findings import Findings, Report
@@ -172,7 +172,7 @@ def _play(
 def _same_spaces(spec: str, data: MinariDataset, report: Report, findings: Findings) -> bool:
     """Return whether the environment can be made and has the dataset's spaces; report why not."""
     try:
-        env = believed_env(spec, "playing episodes again")
+        env = untrusted_env(spec, "playing episodes again")
     except OffbenchError as error:
         report.skipped.append(str(error))
         return False

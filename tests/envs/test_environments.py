@@ -17,7 +17,7 @@ import offbench
 from offbench.common.errors import OffbenchError
 from offbench.data.minari_reader import Recorded
 from offbench.envs import environments
-from offbench.envs.environments import action_box, believed_env, box, checked_spec, env_spec, make_env
+from offbench.envs.environments import action_box, box, checked_spec, env_spec, make_env, untrusted_env
 from offbench.envs.recipes import d4rl_reference
 from offbench.rollouts.policy import uniform
 from offbench.rollouts.rollouts import Named, Rollouts, number
@@ -149,7 +149,7 @@ def test_an_environment_of_the_script_itself_is_refused() -> None:
     sys.modules["__main__"].Mine = Steps  # type: ignore[attr-defined]
     try:
         spec = EnvSpec("Mine-v0", "__main__:Mine").to_json()
-        for attempt in (lambda: env_spec("Mine-v0"), lambda: believed_env(spec, "mine-v0")):
+        for attempt in (lambda: env_spec("Mine-v0"), lambda: untrusted_env(spec, "mine-v0")):
             with pytest.raises(OffbenchError, match=r"__main__.*move it into a module"):
                 attempt()
     finally:
@@ -171,12 +171,12 @@ def test_what_cannot_be_made_again_is_not_sent_after_a_package() -> None:
         assert "install" not in str(error.value)
     absent = EnvSpec("A-v0", "gymnasium_robotics.envs.absent:A", max_episode_steps=5).to_json()
     with pytest.raises(OffbenchError, match="install the package that has the module gymnasium_robotics"):
-        believed_env(absent, "x-v0")
+        untrusted_env(absent, "x-v0")
 
 
 def test_specs_of_older_gymnasium_are_read() -> None:
     old = json.loads(env_spec("InvertedPendulum-v5")) | {"autoreset": False, "apply_api_compatibility": False}
-    assert believed_env(json.dumps(old), "old-v0").observation_space.shape == (4,)
+    assert untrusted_env(json.dumps(old), "old-v0").observation_space.shape == (4,)
 
 
 @pytest.mark.parametrize("reward", [np.array([1.5]), np.array([[1.5]]), np.float32(1.5), 1.5, np.array(1.5)])
