@@ -143,7 +143,7 @@ def _optimizer(model: SAC, name: str) -> torch.optim.Optimizer:
 
 
 def _fill_buffer(folder: TrainingFolder, model: SAC, until: int) -> None:
-    """Put the transitions of all segments up to `until` into the replay buffer, in their order."""
+    """Put the transitions of all segments up to `until` into the replay buffer, in order."""
     buffer = model.replay_buffer
     assert buffer is not None
     buffer.reset()

@@ -113,7 +113,7 @@ class Comparison:
         ]
 
     def row(self) -> JsonObject:
-        """Return the comparison as JSON has it."""
+        """Return the comparison as a JSON object."""
         statistics, chance = self.statistics, self.chance
         return {
             "a": self.a,
@@ -139,8 +139,8 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
     """Compare two groups of runs over the datasets and seeds that both have.
 
     Args:
-        a, b: the names of two methods as tables have them, e.g. `td3_bc` and `bdb (beta=0.5)`; or ALGO/VARIANT, as
-            folders have it. An algorithm alone is its default variant, or its only one.
+        a, b: the names of two methods as in tables, e.g. `td3_bc` and `bdb (beta=0.5)`; or ALGO/VARIANT, as
+            in folders. An algorithm alone is its default variant, or its only one.
         runs: the folder of the run directories.
 
     Raises:

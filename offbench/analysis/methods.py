@@ -22,7 +22,7 @@ class Method:
     """An algorithm with its settings.
 
     Attributes:
-        beta: the value of a setting of that name, as the published tables' columns have it.
+        beta: the value of a setting of that name, as in the columns of the published tables.
         name: a name given to it (a grid's `label`), or one without the settings that all variants here share.
     """
 
@@ -111,7 +111,7 @@ def unnamed_settings(methods: Iterable[Method]) -> list[str]:
 
 def find_method(methods: Sequence[Method], name: str) -> Method:
     """Return the method of a name. See `Results.method`."""
-    name = re.sub(r" \([\d,]+( of [\d,]+)? steps\)$", "", " ".join(name.split()))  # as a column's heading has it
+    name = re.sub(r" \([\d,]+( of [\d,]+)? steps\)$", "", " ".join(name.split()))  # as in a column's heading
     for matches in ([m for m in methods if m.label == name], [m for m in methods if name in m.spellings]):
         if len(matches) == 1:
             return matches[0]

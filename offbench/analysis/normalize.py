@@ -233,7 +233,7 @@ def _cell(row: Row, key: str, short: bool = False) -> str:
         return count(value) if value == row["of_steps"] else f"{count(value)} of {count(row['of_steps'])}"
     if isinstance(value, float):
         std = row.get(f"{key}_std")
-        # one seed has no spread: say so rather than print 0
+        # one seed has no spread, which is not a spread of 0
         spread = "" if f"{key}_std" not in row else " ± " + ("?" if std is None else f"{std:.1f}")
         return f"{value:.1f}{spread}"
     return f"{value:,}" if isinstance(value, int) else str(value)

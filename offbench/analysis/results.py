@@ -210,7 +210,7 @@ class Results:
         return len({trained.window for entry in self.on(task) for trained in entry.runs}) == 1
 
     def method(self, name: str) -> Method:
-        """Return the method of a name: as a table has it, ALGO/VARIANT, or ALGO for its default or only variant.
+        """Return the method of a name: as in a table, ALGO/VARIANT, or ALGO for its default or only variant.
 
         Raises:
             OffbenchError: no such method here, or the algorithm has several variants.
@@ -230,7 +230,7 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
 
     Args:
         datasets: only these, by id or by a pattern such as `hopper-*`; all if empty.
-        methods: only these, by a name as tables have it; all if empty.
+        methods: only these, by their names in tables; all if empty.
 
     Raises:
         OffbenchError: none is evaluated, one is there twice, or there is no such dataset or method. Damaged runs are

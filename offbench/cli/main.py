@@ -212,7 +212,7 @@ def _lost() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _printable_output() -> Iterator[None]:
-    """Print to stdout through `_Printable`, and to the end: a full disk is met here, not when Python exits."""
+    """Print to stdout through `_Printable`, and flush it: a full disk is an error here, not when Python exits."""
     with contextlib.redirect_stdout(_Printable(sys.stdout)):
         try:
             yield
@@ -248,7 +248,7 @@ class Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """Let SIGTERM end a command as Ctrl-C does: with what it has started ended too, and a line that says so."""
+    """Let SIGTERM end a command as Ctrl-C does: its processes end too, and a line is printed."""
 
     def stop(*_: object) -> NoReturn:
         raise Terminated

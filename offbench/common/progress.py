@@ -50,7 +50,7 @@ class Progress:
             self._print()
 
     def skip(self, done: int, work: float | None = None) -> None:
-        """Take in `done` units that were done before, so that they do not count as speed."""
+        """Add `done` units that an earlier session has done; they do not count for the rate."""
         self.done += done
         self._first += done
         self._worked += done if work is None else work

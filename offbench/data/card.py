@@ -99,7 +99,7 @@ def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
 def _keep_hashes(recipe: Recipe, facts: dict[str, JsonObject], mujoco: str) -> None:
     """Add the shipped card's content hashes of other MuJoCo versions to each level, if it describes the same ladder.
 
-    medium-replay tells that: it comes from training, so its content is the same on every MuJoCo version.
+    The content of medium-replay shows it: it comes from training, so it is the same on every MuJoCo version.
     """
     path = recipe.folder / "card.json" if recipe.folder else None
     shipped = read_json(path)["levels"] if path is not None and path.exists() else {}

@@ -66,7 +66,7 @@ def episodes_of(data: MinariDataset, indices: Iterable[int] | None = None) -> It
     """Yield a MinariDataset's episodes (all, or those of `indices`) with their seeds.
 
     Raises:
-        DamagedError, OffbenchError: as `reading` has it.
+        DamagedError, OffbenchError: as in `reading`.
     """
     wanted = [int(i) for i in (data.episode_indices if indices is None else indices)]
     with reading(str(data.storage.metadata.get("dataset_id"))):

@@ -204,7 +204,7 @@ class ContentHash:
         self._hash = hashlib.sha256()
 
     def add(self, observations: Array, actions: Array, rewards: Array, ends: tuple[bool, bool]) -> None:
-        """Take in one episode; the arrays count with their dtype and shape."""
+        """Add one episode; dtype and shape of the arrays count too."""
         for array in (observations, actions, rewards):
             self._hash.update(f"{array.dtype.str}{array.shape}".encode())
             self._hash.update(np.ascontiguousarray(array).data)

@@ -23,7 +23,7 @@ def make_env(name: str, render_mode: str | None = None) -> Env:
 
     Args:
         name: the id of a local dataset, a shipped recipe's name (`hopper`) or a recipe file (`./my-env.toml`).
-        render_mode: as `gymnasium.make` has it.
+        render_mode: as in `gymnasium.make`.
 
     Raises:
         OffbenchError: there is no such dataset or recipe, it names no environment, or that cannot be made.

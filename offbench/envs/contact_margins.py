@@ -40,7 +40,7 @@ def release(version: str) -> tuple[int, int]:
 
 
 def set_contacts(model: mujoco.MjModel, rule: str, name: str) -> None:
-    """Give a freshly loaded model the contacts of a rule, `max` or `sum`; leave it alone, and say so, if that fails.
+    """Give a freshly loaded model the contacts of a rule, `max` or `sum`; if that fails, leave it and print a warning.
 
     Args:
         name: what a warning calls the model.

@@ -281,7 +281,7 @@ def box(space: Space, what: str) -> gym.spaces.Box:
 
 
 def _flattening(space: Space, what: str) -> str:
-    """Return what makes a flat Box of floats of a space of observations; there is nothing like it for actions."""
+    """Return how to turn a space of observations into a flat Box of floats; actions cannot be turned into one."""
     if "observation" not in what:
         return "offbench's algorithms choose continuous actions, one number for each dimension"
     try:

@@ -84,7 +84,7 @@ class Recipe:
         """Return a hash over everything the recipe says (not over its layout or comments)."""
         values = {k: v for k, v in dataclasses.asdict(self).items() if k != "folder"}
         if self.contact_margin == EARLIER:
-            del values["contact_margin"]  # the only rule before it was a setting: hashes of that time stay
+            del values["contact_margin"]  # the only rule before it was a setting, so that earlier hashes stay valid
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 

@@ -20,6 +20,6 @@ def load_policy(path: str | Path) -> Policy:
     """
     path = Path(path)
     if path.is_dir():
-        Run(path).config()  # says so where it is not a run
+        Run(path).config()  # raises if the folder is no run
         return read_policy(Run(path).policy_path)
     return read_policy(path)

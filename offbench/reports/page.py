@@ -19,7 +19,7 @@ from offbench.training.run import Run, Session
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page: its heading, content, and words between them for who reads it on a screen."""
+    """A part of the page: its heading, content, and words between them that are not printed."""
 
     name: str
     title: str

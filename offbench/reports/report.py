@@ -50,7 +50,7 @@ def report(
         out: the report's folder; an older report in it is replaced.
         title: of the page.
         datasets: only these, by id or by a pattern such as `hopper-*`.
-        methods: only these, by a name as tables have it.
+        methods: only these, by their names in tables.
 
     Returns:
         The page.

@@ -93,7 +93,7 @@ def stack_size(spec: RunSpec, data: Transitions, device: str) -> int:
     """Return how many runs like `spec` train best as one stack on this device.
 
     On a GPU it is what the free memory holds, measured: the peak memory of stacks of one and of three runs over a few
-    updates tells what a run takes in addition to the dataset.
+    updates gives what a run takes in addition to the dataset.
     """
     if device == "cpu":
         return CPU_STACK

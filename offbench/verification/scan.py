@@ -36,7 +36,7 @@ class Survey:
 
     @property
     def steps(self) -> int:
-        """Transitions in all."""
+        """Transitions of all episodes."""
         return sum(self.lengths)
 
 

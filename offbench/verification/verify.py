@@ -44,7 +44,7 @@ FEW = 20_000  # steps to play again that are not worth worker processes
 
 
 def verify(dataset_id: str, *, episodes: int | None = None, workers: int | None = None) -> Report:
-    """Check a local Minari dataset with flat Box spaces, whoever made it.
+    """Check a local Minari dataset with flat Box spaces, recorded by offbench or not.
 
     Args:
         dataset_id: its id.
