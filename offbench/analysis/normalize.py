@@ -55,7 +55,7 @@ def count_waiting(runs: str | Path) -> int:
 def _is_waiting(run: Run) -> bool:
     try:
         return not run.evaluations()
-    except OffbenchError:
+    except (OffbenchError, OSError):
         return False
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from offbench.analysis.methods import Method, find_method, method_order, name_methods, rank
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError, unknown
+from offbench.common.files import READ_REMEDIES
 from offbench.common.scores import LAST, Evaluations, mean_std, normalize, run_return, window
 from offbench.common.terminal import warn
 from offbench.common.text import counted, printable
@@ -282,6 +283,10 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
             config, evaluations = run.config(), run.evaluations()
         except OffbenchError as error:
             damaged.append(error)
+            continue
+        except OSError as error:
+            words = f"cannot read {run.folder}: {error.strerror}; {READ_REMEDIES.get(error.errno, 'try again')}"
+            damaged.append(OffbenchError(words))
             continue
         if evaluations:
             key = (config.dataset, config.dataset_sha256, config.algorithm, config.variant)

@@ -15,6 +15,7 @@ import contextlib
 import csv
 import dataclasses
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -327,9 +328,18 @@ def _short(value: object) -> object:
 def find_runs(root: Path) -> list[Run]:
     """Return all runs below a folder in the order of their paths, those with an unreadable config.json included.
 
-    The config.json files of other programs are ignored.
+    A folder that this user may not read counts as a run that cannot be read. The config.json files of other programs
+    are ignored.
     """
-    return [Run(path.parent) for path in sorted(root.rglob("config.json")) if _is_run(path)]
+    closed: list[Path] = []
+
+    def unreadable(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError | NotADirectoryError):
+            closed.append(Path(error.filename))
+
+    walk = os.walk(root, onerror=unreadable)
+    paths = sorted(Path(folder) / "config.json" for folder, _, files in walk if "config.json" in files)
+    return [*(Run(path.parent) for path in paths if _is_run(path)), *map(Run, closed)]
 
 
 def _is_run(path: Path) -> bool:

@@ -6,7 +6,9 @@ import os
 import resource
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +129,70 @@ def test_a_read_only_disk(
     monkeypatch.setenv("OFFBENCH_CACHE", str(small_disk / "cache"))
     assert "cannot write" in refusal(["show", medium], capsys)
     assert Path(cache).exists()
+
+
+@contextmanager
+def without(rights: int, *folders: Path) -> Iterator[None]:
+    """Take these rights from folders and all that is in them."""
+    paths = [path for folder in folders for path in (folder, *folder.rglob("*"))]
+    before = {path: path.stat().st_mode for path in paths}
+    for path in reversed(paths):
+        path.chmod(before[path] & ~rights)
+    try:
+        yield
+    finally:
+        for path in paths:
+            path.chmod(before[path])
+
+
+@pytest.mark.slow
+def test_folders_without_the_right_to_write_or_read(home: Path) -> None:
+    """As those of another user. Root may do everything, so its commands run without that capability here."""
+    capable = (
+        ["setpriv", "--bounding-set=-dac_override,-dac_read_search", "--inh-caps=-all"] if not os.geteuid() else []
+    )
+    if capable and subprocess.run([*capable, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("needs setpriv, or a user other than root")
+
+    def run(*words: str) -> tuple[int, str, str]:
+        command = [*capable, sys.executable, "-m", "offbench", *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert "Traceback" not in done.stderr
+        return done.returncode, done.stdout, done.stderr.splitlines()[-1] if done.stderr else ""
+
+    name = offbench.collect("inverted-pendulum", "random", steps=300, workers=1)
+    train = ["train", "td3_bc", "--dataset", name, "--workers", "1", *SMALL]
+    main(train)
+    (first,) = (run.folder for run in offbench.training.run.find_runs(home / "runs"))
+    made_run(home / "runs", name, "cql", "default", 0, 50)
+    minari, cache, runs = home / "minari", home / "cache", home / "runs"
+    before = state(home)
+    with without(0o222, minari, cache, runs):
+        for words in (["show", name], ["normalize"], ["evaluate", str(first), "--episodes", "1"], train):
+            assert run(*words)[0] == 0
+        for words in (
+            ["evaluate", str(first), "--similarity"],
+            [*train, "--steps", "60"],
+            ["collect", "inverted-pendulum", "--level", "random", "--steps", "300", "--id", "new-v0"],
+        ):
+            code, _, line = run(*words)
+            assert (code, "Permission denied; check its permissions or choose" in line) == (2, True), line
+    with without(0o777, cache):
+        code, _, line = run("show", name)
+        assert (code, "Permission denied" in line) == (2, True)
+    with without(0o777, minari):
+        code, _, line = run("train", "bc", "--dataset", name)
+        assert (code, "Permission denied; check its permissions" in line) == (2, True)
+    for folder in (first, first.parents[1]):  # one run, and all of an algorithm
+        with without(0o777, folder):
+            code, table, line = run("normalize")
+            assert (code, "cql" in table, "td3_bc" in table) == (0, True, False)
+            assert f"warning: left out: cannot read {folder.relative_to(home)}: Permission denied" in line
+    with without(0o777, runs):
+        for command in ("normalize", "report", "compare cql td3_bc"):
+            code, _, line = run(*command.split())
+            assert (code, "cannot read runs: Permission denied; check its permissions" in line) == (2, True), line
+    assert state(home) == before
 
 
 def limited(size: int) -> Callable[[], None]:
