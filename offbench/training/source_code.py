@@ -141,6 +141,8 @@ def _imported(file: Path, root: Path, seen: dict[Path, None]) -> dict[Path, None
             module = start.joinpath(*(node.module or "").split("."))
             modules = [module, *(module / alias.name for alias in node.names)]
         for path in modules:
+            if root / "offbench" in (path, *path.parents):  # the root is a clone, whose version config.json has
+                continue
             _imported(path.with_name(f"{path.name}.py"), root, seen)
             for folder in (path, *path.parents):
                 if root in folder.parents:  # a package, whose __init__.py is run too

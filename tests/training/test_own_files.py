@@ -208,7 +208,8 @@ LAYOUTS = {  # how the file imports a neighbor, and the neighbor
 @pytest.mark.parametrize("line", LAYOUTS)
 def test_an_edit_is_noticed_however_a_neighbor_is_imported(line: str, home: Path) -> None:
     (home / "parts").mkdir()
-    for name in ("losses.py", "parts/losses.py", "parts/__init__.py"):
+    (home / "offbench" / "algos").mkdir(parents=True)  # as in a clone
+    for name in ("losses.py", "parts/losses.py", "parts/__init__.py", "offbench/__init__.py", "offbench/algos/bc.py"):
         (home / name).write_text("WEIGHT = 1\n")
     (home / "parts" / "relative.py").write_text("from . import losses\nWEIGHT = losses.WEIGHT\n")
     (home / "parts" / "absolute.py").write_text("from parts.losses import WEIGHT\n")
