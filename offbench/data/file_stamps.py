@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -38,16 +39,21 @@ def unchanged(dataset_id: str) -> Iterator[Stamps]:
 
 def dataset_stamps(dataset_id: str) -> Stamps:
     """Return the stamp of each file of a dataset by its name; {} if there is none, or it is being replaced."""
+    stamps: Stamps = {}
     try:
-        folder = minari_store.path_of(dataset_id) / "data"
-        return {str(p.relative_to(folder)): stamp(p) for p in sorted(folder.rglob("*")) if p.is_file()}
+        root = f"{minari_store.path_of(dataset_id)}/data/"
+        for folder, _, names in os.walk(root):  # pathlib takes several times as long, twice in each load
+            for path in (os.path.join(folder, name) for name in names):
+                if os.path.isfile(path):
+                    stamps[path.removeprefix(root)] = stamp(path)
     except (OffbenchError, OSError):
         return {}
+    return dict(sorted(stamps.items(), key=lambda item: item[0].split("/")))
 
 
-def stamp(path: Path) -> list[int]:
+def stamp(path: Path | str) -> list[int]:
     """Return what changes with a file's content. Its times can be set, but not when it was last touched (ctime)."""
-    status = path.stat()
+    status = os.stat(path)
     return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
 
 
