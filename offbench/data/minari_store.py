@@ -19,7 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
-from offbench.common.files import JsonObject, disk_errors, exclusive_lock, read_json
+from offbench.common.files import JsonObject, damage, disk_errors, exclusive_lock, read_json
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.settings import read_back, setting
 from offbench.data.levels import parse_level
@@ -187,9 +187,11 @@ def _check_metadata(metadata: JsonObject) -> None:
 
 
 def exists(dataset_id: str) -> bool:
-    """Return whether there is a local dataset of this id, sound or not."""
+    """Return whether there is a local dataset of this id, sound or not. Raises OffbenchError if that is unknown."""
     inside = not dataset_id.startswith((".", "/")) and ".." not in Path(dataset_id).parts and "\0" not in dataset_id
-    return inside and (root() / dataset_id / "data" / "metadata.json").exists()
+    path = root() / dataset_id / "data" / "metadata.json"
+    with damage(str(path), "cannot be looked up", "check the id and the disk"):
+        return inside and path.exists()
 
 
 def provenance(metadata: JsonObject) -> Provenance:
