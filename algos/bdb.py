@@ -11,9 +11,9 @@ D is updated just before the actor, its actions pi(s) detached; it works on logi
 beta = 0 every number is TD3+BC's, bit for bit. Critics start in agreement, so Unc < 1 and the adaptive beta is
 near 1 at first: by the published rule the discriminator alone constrains the policy until Q has grown.
 Deviation: lambda is TD3+BC's, by mean |Q_1(s, pi(s))|, as in the authors' code that the paper builds on (its eq. 12
-has the data's actions). The paper leaves open, and here is: beta per sample (or per batch, `beta_scope`); the Q values
-of Algorithm 2 those of M critics at one action, two by default, and not of their targets; cloning's square a mean over
-the action's dimensions, as in TD3+BC; D's observations normalized as all others.
+has the data's actions). Where the paper leaves it open: beta is computed per sample (`beta_scope`); Algorithm 2
+compares the Q values of the M critics, not of their targets, at pi(s); the cloning error is a mean over the dimensions
+of the action, as in TD3+BC; D takes normalized observations.
 """
 
 from __future__ import annotations

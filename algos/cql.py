@@ -11,12 +11,12 @@ critics are pushed down where the policy or chance would act, and up on the data
                  lagrange: multiplier (penalty - target_action_gap), the multiplier trained to raise it
     temperature  loss = -log(temperature) mean [ log pi(a|s) + target entropy ],  target entropy = -dim(A)
 
-Deviations: log std is at least -20 (theirs: -5); data actions are clipped to +-0.999 (1 - 1e-6), which changes the
-warm-up's gradient; log-densities are exact (theirs add 1e-6 to 1 - a^2); no clamp of the mean (theirs to +-9, for the
-data's actions); the actor sees the critics after their update, as in SB3 (before it), and the temperature before its
-own (after it); initial weights are torch.nn.Linear's (rlkit has its own). The actor has the critics' three hidden
-layers, as in their code (Table 5 gives its width alone). It acts with its mode, as theirs, unless `eval_samples` says
-otherwise: the best of 10, as the grid `paper` has it, is our reading of Table 5.
+Deviations: log std is at least -20 (theirs: -5); data actions are clipped to +-0.999 (theirs: 1 - 1e-6), which changes
+the gradient of the cloning updates; log-densities are exact (theirs add 1e-6 to 1 - a^2); the mean is not clamped
+(theirs to +-9 for data actions); the actor loss uses the critics after their update, as in SB3 (theirs: before), and
+the temperature before its update (theirs: after); initial weights are torch.nn.Linear's (theirs: rlkit's). The actor
+has three hidden layers, as in their code (Table 5 gives its width alone). Evaluations use the mode, as theirs, or the
+best of `eval_samples`: 10 in the grid `paper`, which is our reading of Table 5.
 """
 
 from __future__ import annotations

@@ -48,7 +48,8 @@ def evaluation_spec(metadata: JsonObject) -> str | None:
 def recorded_margin(metadata: JsonObject) -> str | None:
     """Return the rule for contact margins that a dataset was recorded under; None if its metadata do not tell."""
     ours = minari_store.provenance(metadata)
-    if ours.contact_margin or ours.versions:  # recorded by offbench: its earlier versions had the earlier rule alone
+    recorded = "versions" in (metadata.get(minari_store.KEY) or {})  # by offbench, first with the earlier rule alone
+    if ours.contact_margin or recorded:
         return ours.contact_margin or EARLIER
     for operator, major, minor in _demands(metadata):
         version = (int(major), int(minor or 0))

@@ -129,10 +129,11 @@ def load(dataset_id: str) -> Transitions:
 
 def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     metadata = minari_store.read_metadata(dataset_id)
+    expected = minari_store.provenance(metadata).content_sha256
     data = open_parsed(dataset_id)
     observation_space = box(data.observation_space, f"{dataset_id}: observations")
     action_space = action_box(data.action_space, f"{dataset_id}: actions")
-    folder = cache() / _key(dataset_id, metadata, stamps)
+    folder = cache() / _key(dataset_id, expected, stamps)
     sources = {f"data/{name}": minari_store.path_of(dataset_id) / "data" / name for name in stamps}
     cached = _mapped(folder, sources)
     if cached is None:
@@ -148,7 +149,7 @@ def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     if cached is None:
         raise OffbenchError(f"cannot read back {folder}; delete it and try again")
     content, arrays = cached[0], dict[str, Any](cached[1])
-    if minari_store.provenance(metadata).content_sha256 not in (None, content):
+    if expected not in (None, content):
         raise OffbenchError(
             f"{dataset_id} is damaged: its arrays are not those of the content_sha256 in its metadata; "
             "record or download it again"
@@ -188,11 +189,10 @@ def cache() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "offbench"
 
 
-def _key(dataset_id: str, metadata: JsonObject, stamps: Stamps) -> str:
+def _key(dataset_id: str, content: str | None, stamps: Stamps) -> str:
     """Return the cache's name for a dataset: it changes with the content and with the files."""
     folder = minari_store.path_of(dataset_id) / "data"
     sizes_and_times = [(name, size, mtime) for name, (size, mtime, *_) in stamps.items()]
-    content = minari_store.provenance(metadata).content_sha256
     text = json.dumps([4, dataset_id, content, str(folder), sizes_and_times])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 

@@ -117,9 +117,7 @@ def _renderable(spec: str, backend: str | None) -> Env:
     """Make the environment for rendering. Raises OffbenchError if it cannot be rendered here."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # that it does not list this mode: the first frame shows whether it supports it
+            warnings.simplefilter("ignore")  # of a mode that it does not list: the first frame shows if it works
             env = make_env(spec, "rgb_array")
     except Exception as error:  # a third party's environment may raise anything here
         raise OffbenchError(f"{json.loads(spec)['id']} cannot be rendered (render_mode rgb_array): {error}") from error
