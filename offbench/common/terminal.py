@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 NARROW, NARROWEST = 28, 12  # widths of a column of names
-LABEL = re.compile(r" *([A-Za-z][\w -]*?  +|\w+_\w+ )(?=\S)")  # at the start of a line
+LABEL = re.compile(r" *([A-Za-z][\w -]*?  +|\w+_sha256 )(?=\S)")  # at the start of a line
 GLUE = "\0"  # stands for a space that is no place to break a line
 
 

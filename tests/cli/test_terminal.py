@@ -94,11 +94,18 @@ def test_what_is_in_a_dataset_fits(
     plain = capsys.readouterr().out
     text = screen(columns, "show", medium)
     assert "\x1b[36mreturn          \x1b[0mmean" in text
+    assert "\x1b[36m  policy_sha256 \x1b[0m" in text
     lines = COLOR.sub("", text).splitlines()
     assert max(map(len, lines)) <= columns
     assert "".join(plain.split()) == "".join("".join(lines).split())
     first = next(i for i, line in enumerate(lines) if line.startswith("versions"))
     assert lines[first + 1].startswith(16 * " ")  # below the text, not below the label
+
+
+def test_the_name_of_a_method_is_no_label(screen: Callable[..., str], home: Path) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    made_run(home / "runs", "hopper-medium-v0", "bc", "default", 0, 40)
+    assert "td3_bc against bc" in screen(80, "compare", "td3_bc", "bc")
 
 
 def test_no_color_where_it_is_not_wanted(screen: Callable[..., str], home: Path) -> None:
