@@ -137,6 +137,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions
         _complete()
     _open_closed()
+    os.environ["MPLBACKEND"] = "Agg"  # figures are files; matplotlib does not import with a name that it does not have
     try:
         with contextlib.redirect_stderr(_Lossy(sys.stderr)):
             _main(words)

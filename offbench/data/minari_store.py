@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -92,13 +92,19 @@ def path_of(dataset_id: str) -> Path:
     return root() / check_id(dataset_id)
 
 
-def local_ids() -> list[str]:
-    """Return the ids of all local datasets, hidden folders and strays left out."""
-    base = root()
-    if not base.is_dir():
-        return []
-    folders = (path.parent.parent.relative_to(base) for path in base.glob("**/data/metadata.json"))
-    return sorted(str(path) for path in folders if not any(part.startswith(".") for part in path.parts))
+def local_ids(unreadable: Callable[[OSError], None] | None = None) -> list[str]:
+    """Return the ids of all local datasets, hidden folders and strays left out.
+
+    Args:
+        unreadable: is called with the error of each folder that cannot be read.
+    """
+    base, ids = root(), []
+    for folder, folders, _ in os.walk(base, onerror=unreadable, followlinks=True):
+        if os.path.isfile(os.path.join(folder, "data", "metadata.json")):
+            ids.append(os.path.relpath(folder, base))
+            folders.clear()
+        folders[:] = [name for name in folders if not name.startswith(".")]
+    return sorted(ids)
 
 
 def recorded_by(dataset_id: str) -> tuple[str, str]:

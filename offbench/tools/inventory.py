@@ -60,7 +60,7 @@ def _environments() -> JsonObject:
 
 def _datasets() -> JsonObject:
     datasets = {}
-    for dataset_id in minari_store.local_ids():
+    for dataset_id in minari_store.local_ids(_warn_of_unreadable):
         try:
             metadata = minari_store.read_metadata(dataset_id)
             counts = {key: int(metadata[key]) for key in ("total_steps", "total_episodes")}
@@ -72,6 +72,11 @@ def _datasets() -> JsonObject:
         more = {"algorithm_name": metadata.get("algorithm_name"), "short_of": full if short else None}
         datasets[dataset_id] = counts | more
     return datasets
+
+
+def _warn_of_unreadable(error: OSError) -> None:
+    if not isinstance(error, FileNotFoundError):
+        warn(f"left out: cannot read {error.filename}: {error.strerror}; check its permissions")
 
 
 def _runs(root: str | Path) -> list[JsonObject]:

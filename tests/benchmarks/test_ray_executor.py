@@ -166,7 +166,6 @@ def test_an_algorithm_of_ones_own_is_sent_to_the_nodes(
     (home / "mine" / "parts" / "half.py").write_text("HALF = 0.5\n")
     (home / "mine" / "algo.py").write_text(ALGO)
     (home / "mine" / "losses.py").write_text(LOSSES)
-    monkeypatch.setattr(sys, "path", list(sys.path))
     assert run("local", None)
     executor = ray_executor.RayExecutor(nodes.address, slice_seconds=2)
     send = executor._send_code

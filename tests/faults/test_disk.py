@@ -184,6 +184,10 @@ def test_folders_without_the_right_to_write_or_read(home: Path) -> None:
         for words in (["train", "bc", "--dataset", name], ["export", name, "--out", "out.npz"]):
             code, _, line = run(*words)
             assert (code, f"cannot read {minari / name}" in line, "check its permissions" in line) == (2, True, True)
+    for folder in (minari, minari / name, minari / name / "data"):
+        with without(0o777, folder):
+            code, _, line = run("list", "datasets")
+            assert (code, f"warning: left out: cannot read {folder}: Permission denied" in line) == (0, True), line
     for folder in (first, first.parents[1]):  # one run, and all of an algorithm
         with without(0o777, folder):
             code, table, line = run("normalize")

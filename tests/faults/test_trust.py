@@ -79,7 +79,6 @@ def own(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A module `own` beside the run that names it; its import leaves a file."""
     (home / "own.py").write_text(OWN)
     monkeypatch.syspath_prepend(str(home))
-    monkeypatch.delitem(sys.modules, "own", raising=False)
     return home
 
 

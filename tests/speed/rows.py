@@ -107,7 +107,7 @@ def rows(dataset: str) -> list[Row]:
             0.95,
             0.98,
             1.0,
-            11,
+            25,
         ),
         Row(
             f"evaluation with {n} workers vs SB3's evaluate_policy",

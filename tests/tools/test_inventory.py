@@ -31,6 +31,17 @@ def test_json_has_all_but_the_runs(medium: str, capsys: pytest.CaptureFixture[st
     assert list(listed(capsys, "levels")) == ["levels"]
 
 
+def test_datasets_in_a_namespace_and_behind_a_link(
+    medium: str, home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As Minari lists them: a link may lead to another disk, and hidden folders are left out."""
+    (home / "minari" / "space" / ".hidden").mkdir(parents=True)
+    (home / "minari" / medium).rename(home / "elsewhere")
+    for link in (medium, "space/linked-v0", "space/.hidden/it-v0"):
+        (home / "minari" / link).symlink_to(home / "elsewhere")
+    assert list(listed(capsys, "datasets")["datasets"]) == ["space/linked-v0", medium]
+
+
 def test_runs_have_the_mean_of_their_last_evaluations(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made_run(home / "runs", "hopper-medium-v0", "bdb", "default", 0, 40, settings={"beta": "adaptive"})
     second = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 1, 60, reached=20_000)

@@ -24,7 +24,7 @@ from offbench.training.run import Run
 from offbench.training.source_code import changes, code_of
 from offbench.training.train import restore
 from tests.cli.test_bad_input import refusal
-from tests.conftest import ROOT
+from tests.conftest import ROOT, forget_modules
 from tests.made_runs import made_run
 
 DATA = "pendulum-small-v0"
@@ -35,27 +35,20 @@ EXAMPLE = (ROOT / "docs" / "examples" / "awac.py").read_text()
 
 @pytest.fixture(autouse=True)
 def _alone(home: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Give each test a dataset, and forget the algorithms and modules that it used."""
+    """Give each test a dataset, and forget the algorithms that it used."""
     shutil.copytree(ROOT / "tests" / "fixtures" / "earlier" / "minari", home / "minari")
     monkeypatch.setattr(registry, "_own", {})
     monkeypatch.setattr(source_code, "_codes", {})
-    monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delenv(registry.OWN, raising=False)
-    before = set(sys.modules)
     yield
     os.environ.pop(registry.OWN, None)
-    for name in set(sys.modules) - before:
-        if str(home) in str(getattr(sys.modules[name], "__file__", "")):
-            del sys.modules[name]
 
 
 def again(home: Path) -> None:
     """Forget what a process knows of own algorithms, as a new process does."""
     registry._own.clear()
     source_code._codes.clear()
-    for name, module in list(sys.modules.items()):
-        if str(home) in str(getattr(module, "__file__", "")):
-            del sys.modules[name]
+    forget_modules(home)
     shutil.rmtree(home / "__pycache__", ignore_errors=True)
 
 
