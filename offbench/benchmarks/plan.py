@@ -156,7 +156,8 @@ class Plan:
     def _total(self) -> Iterator[str]:
         machine = self.bench.machine
         cpu = machine.device == "cpu"
-        where = f"{machine.processes} processes of one thread" if cpu else machine.device
+        processes = "one process" if machine.processes == 1 else f"{machine.processes} processes"
+        where = f"{processes} of one thread" if cpu else machine.device
         yield (f"  on {where} about {duration(self._seconds)}, {self._disk / 1e9:.1f} GB of disk (measured just now)")
         if cpu:
             yield (
