@@ -13,6 +13,8 @@ import pytest
 import threadpoolctl
 import torch
 
+from offbench.training import registry
+
 ROOT = Path(__file__).parent.parent
 
 # pytest-xdist runs a process for each core, so each process computes with one thread
@@ -63,11 +65,13 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
 
 @pytest.fixture(autouse=True)
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Datasets, cache and runs of one test, away from the user's own; modules imported from it are forgotten."""
+    """Datasets, cache and runs of one test, away from the user's own; what it imports and registers is forgotten."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     monkeypatch.setenv("OFFBENCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(registry, "_own", {})
+    monkeypatch.setenv(registry.OWN, "{}")
     yield tmp_path
     forget_modules(tmp_path)
 

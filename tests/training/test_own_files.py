@@ -8,7 +8,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +33,10 @@ EXAMPLE = (ROOT / "docs" / "examples" / "awac.py").read_text()
 
 
 @pytest.fixture(autouse=True)
-def _alone(home: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Give each test a dataset, and forget the algorithms that it used."""
+def _alone(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give each test a dataset, and the source code of no algorithm."""
     shutil.copytree(ROOT / "tests" / "fixtures" / "earlier" / "minari", home / "minari")
-    monkeypatch.setattr(registry, "_own", {})
     monkeypatch.setattr(source_code, "_codes", {})
-    monkeypatch.delenv(registry.OWN, raising=False)
-    yield
-    os.environ.pop(registry.OWN, None)
 
 
 def again(home: Path) -> None:
