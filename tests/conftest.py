@@ -79,7 +79,8 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def forget_modules(folder: Path) -> None:
     """Let modules that were imported from a folder be imported anew."""
     for name, module in list(sys.modules.items()):
-        where = [vars(module).get("__file__"), *(vars(module).get("__path__") or ())]  # a folder has no file
+        about = getattr(module, "__dict__", {})  # a test may have put None in a module's place
+        where = [about.get("__file__"), *(about.get("__path__") or ())]  # a folder has no file
         if any(str(path).startswith(str(folder)) for path in where):
             del sys.modules[name]
 
