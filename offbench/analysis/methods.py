@@ -14,6 +14,7 @@ from offbench.training.run import RunConfig
 from offbench.training.spec import folder_name
 
 METHOD_ORDER = ("td3_bc", "cql", "bdb")  # of the BDB paper's Table 1
+BY_DATASET = "different for each dataset"  # the variant of a method that several variants are, on other datasets each
 OURS = FORMER_SETTINGS["bdb"].keys()  # settings that make an earlier version's BDB another method than the paper's
 
 
@@ -79,24 +80,35 @@ def name_methods(configs: Mapping[tuple[str, str], Sequence[RunConfig]]) -> dict
 
     A name is the label that all its runs have (`label` of a grid's entry), or the algorithm with beta and the settings
     that tell its variants apart here: what they share is left out, except settings that make another method of it.
+    Variants of an algorithm with one label are one method, unless two of them are on the same dataset.
 
     Args:
         configs: the config.json of every run of each method.
     """
     plain = {key: method_of(*key, runs[0].settings) for key, runs in configs.items()}
+    labels = {key: _label(runs) for key, runs in configs.items()}
+    for name in {(key[0], label) for key, label in labels.items() if label}:
+        alike = [key for key in configs if (key[0], labels[key]) == name]
+        datasets = [{config.dataset for config in configs[key]} for key in alike]
+        if len(alike) > 1 and len(set.union(*datasets)) == sum(map(len, datasets)):
+            plain |= dict.fromkeys(alike, Method(name[0], BY_DATASET))
     names = {}
     for key, method in plain.items():
-        labels = {config.label for config in configs[key]}
-        given = labels.pop() if len(labels) == 1 else None
         siblings = [set(other.settings) for other in plain.values() if other.algorithm == method.algorithm]
         shared = {part for part in set.intersection(*siblings) if "=" in part}
         shared = {part for part in shared if part.partition("=")[0] not in {*OURS, "beta"}}
-        names[key] = given or method.named(shared)
-    taken = Counter(names.values())
+        names[key] = labels[key] or method.named(shared)
+    taken = Counter(name for name, _ in {(names[key], method) for key, method in plain.items()})
     return {
         key: dataclasses.replace(method, name=names[key] if taken[names[key]] == 1 else method.named())
         for key, method in plain.items()
     }
+
+
+def _label(runs: Sequence[RunConfig]) -> str:
+    """Return the label that all runs have, else an empty one."""
+    labels = {config.label for config in runs}
+    return labels.pop() if len(labels) == 1 else ""
 
 
 def unnamed_settings(methods: Iterable[Method]) -> list[str]:

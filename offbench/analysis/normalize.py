@@ -71,7 +71,7 @@ def _row(entry: Entry, twins: bool) -> Row:
         **({"content": entry.task.content[:DIGITS]} if twins else {}),
         "method": entry.method.label,
         "algorithm": entry.method.algorithm,
-        "variant": entry.method.variant,
+        "variant": entry.runs[0].config.variant,
         "seeds": len(entry.runs),
         "steps": entry.reached,
         "of_steps": entry.steps,

@@ -8,12 +8,14 @@ name = "bdb"                       # or "./my_algo.py:ReBRAC"
                                    # then its settings; a list makes a variant per value (hidden: a list of lists)
 beta = [0.25, "adaptive"]
 label = "BDB"                      # its name in tables, if the settings are one variant
+datasets = ["hopper-*"]            # optional: only those of the grid's datasets that match
 steps = 500_000                    # optional: its own seeds, steps, eval_every and eval_episodes
 """
 
 from __future__ import annotations
 
 import dataclasses
+import fnmatch
 import importlib.resources
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -56,11 +58,13 @@ class Entry:
 
     Attributes:
         label: the name in tables of the one variant that the settings are; empty for the usual name.
+        datasets: the ids of those that it trains on.
     """
 
     algorithm: str
     settings: Mapping[str, object]
     times: Times
+    datasets: tuple[str, ...]
     label: str = ""
 
 
@@ -102,11 +106,9 @@ def load_grid(name: str) -> Grid:
     sources = _list(values.pop("datasets", []), "datasets", where)
     entries = _list(values.pop("algorithms", []), "algorithms", where)
     times = _times(values, Times(), where)
-    return Grid(
-        path.stem,
-        tuple(_source(value, path.parent, where) for value in sources),
-        tuple(_entry(value, times, path.parent, where) for value in entries),
-    )
+    datasets = tuple(_source(value, path.parent, where) for value in sources)
+    ids = [source.id for source in datasets]
+    return Grid(path.stem, datasets, tuple(_entry(value, times, ids, path.parent, where) for value in entries))
 
 
 def _list(value: object, key: str, where: str) -> list[object]:
@@ -144,7 +146,7 @@ def _source(value: object, folder: Path, where: str) -> Source:
     return Source(value, env, level)
 
 
-def _entry(value: object, times: Times, folder: Path, where: str) -> Entry:
+def _entry(value: object, times: Times, ids: Sequence[str], folder: Path, where: str) -> Entry:
     if not isinstance(value, dict) or not isinstance(value.get("name"), str):
         raise OffbenchError(f"{where}: each of [[algorithms]] needs a name")
     own = {field.name for field in dataclasses.fields(Times)}
@@ -153,8 +155,13 @@ def _entry(value: object, times: Times, folder: Path, where: str) -> Entry:
     label = value.get("label", "")
     if not isinstance(label, str) or len(label) > LONGEST_LABEL or not label.isprintable():
         raise OffbenchError(f"{entry}: label must be a line of at most {LONGEST_LABEL} characters, not {label!r:.80}")
-    settings = {key: item for key, item in value.items() if key not in own and key not in ("name", "label")}
+    patterns = value.get("datasets", ["*"])
+    for pattern in _list(patterns, "datasets", entry):
+        if not isinstance(pattern, str) or not fnmatch.filter(ids, pattern):
+            raise OffbenchError(f"{entry}: no dataset of this grid matches {pattern!r}; there are {', '.join(ids)}")
+    datasets = tuple(name for name in ids if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns))
+    settings = {key: item for key, item in value.items() if key not in own | {"name", "label", "datasets"}}
     name = value["name"]
     beside = folder / name  # an algorithm's file may be named from the grid's folder
     file = ".py" in name and beside.with_suffix(".py").is_file()
-    return Entry(str(beside) if file else name, settings, changed, label)
+    return Entry(str(beside) if file else name, settings, changed, datasets, label)

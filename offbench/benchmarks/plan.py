@@ -35,7 +35,7 @@ class Benchmark:
     """A grid on a machine: what `Plan` describes and `benchmark` runs.
 
     Attributes:
-        variants: the runs of each algorithm with one combination of settings, on all datasets: a column of the table.
+        variants: the runs of each algorithm with one combination of settings, on all its datasets.
     """
 
     grid: Grid
@@ -82,13 +82,21 @@ def prepare(
         variant
         for entry in read.entries
         for variant in specs_of(
-            entry.algorithm, entry.settings, datasets, entry.times, Path(runs), precision, env_spec, label=entry.label
+            entry.algorithm,
+            entry.settings,
+            entry.datasets,
+            entry.times,
+            Path(runs),
+            precision,
+            env_spec,
+            label=entry.label,
         )
     ]
-    if len({(variant[0].algorithm, variant[0].variant) for variant in variants}) < len(variants):
-        raise OffbenchError(f"{read.name}: an algorithm with the same settings comes twice")
+    folders = [spec.folder for variant in variants for spec in variant]
     if len(set(datasets)) < len(datasets):
         raise OffbenchError(f"{read.name}: a dataset comes twice")
+    if len(set(folders)) < len(folders):
+        raise OffbenchError(f"{read.name}: an algorithm with the same settings comes twice")
     for source in read.datasets:
         check_recorded(source)
     return Benchmark(read, tuple(variants), pick_machine(device, workers, stack, precision), precision)

@@ -54,6 +54,31 @@ def test_a_label_is_the_name_unless_two_methods_have_it() -> None:
     assert (one.label, other.label) == ("cql (bc_steps=1)", "td3_bc")
 
 
+def test_variants_with_one_label_on_other_datasets_are_one_method() -> None:
+    common: dict[str, Any] = {"algorithm": "rebrac", "dataset_sha256": "", "seed": 0, "steps": 1, "references": {}}
+
+    def methods(*datasets: tuple[str, ...]) -> list[Method]:
+        return list(
+            name_methods(
+                {
+                    ("rebrac", variant): [
+                        RunConfig(variant=variant, settings={}, label="rebrac", dataset=name, **common)
+                        for name in names
+                    ]
+                    for variant, *names in datasets
+                }
+            ).values()
+        )
+
+    one, other = methods(("default", "a-v0", "b-v0"), ("actor_penalty=0.1", "c-v0"))
+    assert one == other
+    assert one.label == "rebrac"
+    assert unnamed_settings([one]) == ["rebrac: different for each dataset"]
+    assert find_method([one], "rebrac") == one
+    one, other = methods(("default", "a-v0", "b-v0"), ("actor_penalty=0.1", "b-v0"))
+    assert (one.label, other.label) == ("rebrac", "rebrac (actor_penalty=0.1)")
+
+
 def test_every_spelling_is_found() -> None:
     methods = named(("td3_bc", "default", None), ("bdb", "beta=0.5", 0.5), ("bdb", "default", "adaptive"))
     for method in methods:

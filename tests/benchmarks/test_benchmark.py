@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import offbench
+from offbench.analysis.results import read_results
 from offbench.benchmarks.benchmark import LocalExecutor, benchmark, shard_of
 from offbench.benchmarks.grid import load_grid, shipped_grids
 from offbench.benchmarks.plan import Plan, prepare
@@ -23,6 +24,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.settings import fields as settings_of
 from offbench.data import minari_store
 from offbench.envs.recipes import load_recipe
+from offbench.reports.tables import score_table
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run, find_runs
 from offbench.training.spec import Job, RunSpec
@@ -100,6 +102,23 @@ def test_the_plans_operations_are_those_counted_by_hand(algorithm: str, settings
     wanted = sum(often * 2 * np.prod([float(size) for size in product]) for often, product in by_hand)
     counted = operations(spec, load_recipe("hopper").env_spec())
     assert counted == pytest.approx(wanted, rel=1e-9)
+
+
+def test_settings_of_each_dataset_are_one_column(home: Path) -> None:
+    """Two entries with one label, on a dataset each: two variants when they train, one method in tables."""
+    ids = [offbench.collect("inverted-pendulum", "random", steps=300, workers=1, dataset_id=f"{x}-v0") for x in "ab"]
+    text = f"datasets = {ids}\nseeds = 1\nsteps = 20\neval_every = 20\neval_episodes = 1\n"
+    for name, rate in zip(ids, ("1e-3", "1e-4"), strict=True):
+        text += f'[[algorithms]]\nname = "bc"\nlabel = "tuned"\ndatasets = ["{name[0]}-*"]\nlearning_rate = {rate}\n'
+    (home / "grid.toml").write_text(text)
+    bench = prepare("./grid.toml", workers=1)
+    assert next(iter(Plan(bench))) == "grid: 2 datasets, 2 variants, 2 runs, 2 to train"
+    assert benchmark(bench, say=silent)
+    rows = [(row["dataset"], row["method"], row["variant"]) for row in offbench.normalize()]
+    assert rows == [("a-v0", "tuned", "learning_rate=0.001"), ("b-v0", "tuned", "learning_rate=0.0001")]
+    results = read_results("runs")
+    assert score_table(results).header == ["level", "environment", "tuned"]
+    assert list(results.scores(results.method("tuned"))) == ids
 
 
 def test_a_finished_grid_is_left_alone(grid: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -249,6 +268,18 @@ BAD: dict[str, tuple[str, str]] = {
     "bad id": ('datasets = ["a"]\n[[algorithms]]\nname = "bc"', "is not a dataset id"),
     "twice": ('datasets = ["a-v0"]\n[[algorithms]]\nname = "bc"\n[[algorithms]]\nname = "bc"', "comes twice"),
     "dataset twice": ('datasets = ["a-v0", "a-v0"]\n[[algorithms]]\nname = "bc"', "a dataset comes twice"),
+    "dataset of another grid": (
+        'datasets = ["a-v0"]\n[[algorithms]]\nname = "bc"\ndatasets = ["b-*"]',
+        "bc: no dataset of this grid matches 'b-*'; there are a-v0",
+    ),
+    "no list of datasets": (
+        'datasets = ["a-v0"]\n[[algorithms]]\nname = "bc"\ndatasets = "a-*"',
+        "datasets must be a list",
+    ),
+    "twice on one dataset": (
+        'datasets = ["a-v0", "b-v0"]\n[[algorithms]]\nname = "bc"\n[[algorithms]]\nname = "bc"\ndatasets = ["b-v0"]',
+        "comes twice",
+    ),
     "no name": ('datasets = ["a-v0"]\n[[algorithms]]\nbeta = 1', "needs a name"),
     "unknown algorithm": ('datasets = ["a-v0"]\n[[algorithms]]\nname = "td3bc"', "did you mean 'td3_bc'"),
     "unknown setting": ('datasets = ["a-v0"]\n[[algorithms]]\nname = "bdb"\nbta = 1', "did you mean 'beta'"),
