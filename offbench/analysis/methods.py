@@ -87,11 +87,11 @@ def name_methods(configs: Mapping[tuple[str, str], Sequence[RunConfig]]) -> dict
     """
     plain = {key: method_of(*key, runs[0].settings) for key, runs in configs.items()}
     labels = {key: _label(runs) for key, runs in configs.items()}
-    for name in {(key[0], label) for key, label in labels.items() if label}:
-        alike = [key for key in configs if (key[0], labels[key]) == name]
+    for algorithm, label in {(key[0], label) for key, label in labels.items() if label}:
+        alike = [key for key in configs if key[0] == algorithm and labels[key] == label]
         datasets = [{config.dataset for config in configs[key]} for key in alike]
         if len(alike) > 1 and len(set.union(*datasets)) == sum(map(len, datasets)):
-            plain |= dict.fromkeys(alike, Method(name[0], BY_DATASET))
+            plain |= dict.fromkeys(alike, Method(algorithm, BY_DATASET))
     names = {}
     for key, method in plain.items():
         siblings = [set(other.settings) for other in plain.values() if other.algorithm == method.algorithm]
