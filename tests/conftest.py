@@ -78,7 +78,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def forget_modules(folder: Path) -> None:
     """Let modules that were imported from a folder be imported anew."""
-    for name, module in list(sys.modules.items()):
+    for name, module in sys.modules.copy().items():
         about = getattr(module, "__dict__", {})  # a test may have put None in a module's place
         where = [about.get("__file__"), *(about.get("__path__") or ())]  # a folder has no file
         if any(str(path).startswith(str(folder)) for path in where):

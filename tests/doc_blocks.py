@@ -159,7 +159,11 @@ def _run_and_stop(command: str, home: Path, environment: dict[str, str]) -> None
             break
         time.sleep(0.5)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=120)
+    try:
+        _, errors = process.communicate(timeout=120)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        _, errors = process.communicate()
     assert process.returncode == 130, errors
     assert "rerun the same command to resume" in errors
     print(f"stopped   {command}")
