@@ -153,7 +153,8 @@ def test_rows_of_another_kind_are_neither_trained_on_nor_exported(
 def test_flags_that_are_numbers_count_as_flags(kind: Any) -> None:
     name = planted("numbers-v0", "terminations", np.array([0, 0, 1], kind))
     np.testing.assert_array_equal(offbench.load(name).masks, [1, 1, 0])
-    np.testing.assert_array_equal(np.load(offbench.export(name, "out.npz"))["terminals"], [False, False, True])
+    with np.load(offbench.export(name, "out.npz")) as arrays:
+        np.testing.assert_array_equal(arrays["terminals"], [False, False, True])
 
 
 def test_an_export_does_not_round_numbers_to_infinity(home: Path) -> None:
