@@ -12,7 +12,7 @@ from offbench.analysis.results import REFERENCES, Entry, Task, Trained, read_res
 from offbench.analysis.statistics import Estimate, Paired, improvement, paired
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
-from offbench.common.text import counted
+from offbench.common.text import aligned, counted, from_to, plural
 
 LEVEL = 0.05  # a difference is evidence below this p, if its interval leaves out 0 too
 
@@ -62,9 +62,7 @@ class Comparison:
     def verdict(self) -> str:
         """Who is better, or that there is no evidence of a difference."""
         estimate, sizes = self.statistics.difference, Counter(pair.dataset for pair in self.pairs)
-        counts = sorted(set(sizes.values()))
-        over = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-        over += " seed" if counts[-1] == 1 else " seeds"
+        over = f"{from_to(sizes.values())} {plural(max(sizes.values()), 'seed')}"
         over += f" on {len(sizes)} datasets" if len(sizes) > 1 else ""
         if not self.comparable:
             return "no verdict: the scores are of evaluations at different steps"
@@ -107,10 +105,8 @@ class Comparison:
         """Return the scores of each pair below a header that says whose they are."""
         header = ["dataset", "seed", self.a, self.b, "difference"]
         rows = [[p.dataset, str(p.seed), f"{p.a:.1f}", f"{p.b:.1f}", f"{p.a - p.b:+.1f}"] for p in self.pairs]
-        widths = [max(len(line[i]) for line in [header, *rows]) for i in range(len(header))]
-        return [
-            "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]) for line in [header, *rows]
-        ]
+        head, _, *lines = aligned(header, rows)
+        return [head, *lines]
 
     def row(self) -> JsonObject:
         """Return the comparison as a JSON object."""
@@ -159,7 +155,7 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
             "a dataset without reference scores has raw returns, which do not average with other datasets' scores; "
             "give a --runs folder of one dataset"
         )
-    pairs = [Pair(t.name, one.seed, one.score(t.reference), other.score(t.reference)) for t, one, other in both]
+    pairs = _scored(both)
     trained = [[one for _, one, _ in both], [other for *_, other in both]]
     return Comparison(
         groups[0][0].method.label,
@@ -192,10 +188,7 @@ def comparable(both: Partners) -> bool:
 
 def differences(both: Partners) -> dict[str, list[float]]:
     """Return {task: score of A's run minus score of B's, for each pair}."""
-    by_task: dict[str, list[float]] = {}
-    for task, one, other in both:
-        by_task.setdefault(task.name, []).append(one.score(task.reference) - other.score(task.reference))
-    return by_task
+    return _by_dataset(_scored(both), lambda pair: pair.a - pair.b)
 
 
 def favored(statistics: Paired) -> int:
@@ -204,6 +197,10 @@ def favored(statistics: Paired) -> int:
     if low is None or high is None or low <= 0 <= high or statistics.p > LEVEL:
         return 0
     return 1 if low > 0 else -1
+
+
+def _scored(both: Partners) -> list[Pair]:
+    return [Pair(t.name, one.seed, one.score(t.reference), other.score(t.reference)) for t, one, other in both]
 
 
 def _by_dataset(pairs: Iterable[Pair], value: Callable[[Pair], float]) -> dict[str, list[float]]:

@@ -17,7 +17,7 @@ from offbench.analysis.statistics import iqm
 from offbench.common import scores
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, csv_bytes
-from offbench.common.tables import latex, markdown
+from offbench.common.tables import latex, markdown, tabular
 from offbench.common.text import aligned, compact, no_formula
 from offbench.envs.recipes import load_recipe
 from offbench.training.run import DIGITS, Run, find_runs
@@ -162,7 +162,8 @@ def render(rows: Sequence[Row], style: str = "table") -> str:
     if style == "markdown":
         return "\n".join([*markdown(header, cells), *(line for note in notes(rows) for line in ("", f"note: {note}"))])
     if style == "latex":
-        return "\n".join([_latex(header, cells), *(f"% note: {note}" for note in notes(rows))])
+        header, *cells = [[latex(text) for text in line] for line in [header, *cells]]
+        return "\n".join([*tabular(header, cells, len(header)), *(f"% note: {note}" for note in notes(rows))])
     lines = aligned(header, cells, sum(key in NAMES for key in keys))
     return "\n".join([*lines, *(f"note: {note}" for note in notes(rows))])
 
@@ -232,16 +233,5 @@ def _cell(row: Row, key: str, short: bool = False) -> str:
         count = compact if short else "{:,}".format
         return count(value) if value == row["of_steps"] else f"{count(value)} of {count(row['of_steps'])}"
     if isinstance(value, float):
-        std = row.get(f"{key}_std")
-        # one seed has no spread, which is not a spread of 0
-        spread = "" if f"{key}_std" not in row else " ± " + ("?" if std is None else f"{std:.1f}")
-        return f"{value:.1f}{spread}"
+        return scores.plus_minus((value, row[f"{key}_std"])) if f"{key}_std" in row else f"{value:.1f}"
     return f"{value:,}" if isinstance(value, int) else str(value)
-
-
-def _latex(header: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
-    body = [" & ".join(map(latex, line)) + r" \\" for line in [header, *cells]]
-    lines = [body[0], r"\midrule", *body[1:]]
-    return "\n".join(
-        [f"\\begin{{tabular}}{{{'l' * len(header)}}}", r"\toprule", *lines, r"\bottomrule", r"\end{tabular}"]
-    )

@@ -24,7 +24,7 @@ from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import READ_REMEDIES
 from offbench.common.scores import LAST, Evaluations, mean_std, normalize, run_return, window
 from offbench.common.terminal import warn
-from offbench.common.text import counted, printable
+from offbench.common.text import from_to, plural, printable
 from offbench.data.levels import LEVELS
 from offbench.training.run import DIGITS, Run, RunConfig, find_runs
 
@@ -261,10 +261,8 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
 def window_words(runs: Iterable[Trained]) -> str:
     """Return which evaluations are behind the scores of runs: `10 evaluations, steps 5,000 to 50,000`."""
     windows = [trained.window for trained in runs]
-    fewest, most = (len(f(windows, key=len)) for f in (min, max))
-    count = counted(most, "evaluation") if fewest == most else f"{fewest} to {most} evaluations"
-    first, last = min(steps[0] for steps in windows), max(steps[-1] for steps in windows)
-    return f"{count}, " + (f"step {last:,}" if first == last else f"steps {first:,} to {last:,}")
+    counts, ends = {len(steps) for steps in windows}, {end for steps in windows for end in (steps[0], steps[-1])}
+    return f"{from_to(counts)} {plural(max(counts), 'evaluation')}, {plural(len(ends), 'step')} {from_to(ends)}"
 
 
 def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:

@@ -46,3 +46,9 @@ def run_return(evaluations: Evaluations) -> float:
 def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
     """Return mean and sample standard deviation (n - 1) over seeds; None for the deviation of one seed."""
     return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
+
+
+def plus_minus(mean_and_std: tuple[float, float | None]) -> str:
+    """Return `mean ± std`; one seed has no spread, which is not a spread of 0: `mean ± ?`."""
+    mean, std = mean_and_std
+    return f"{mean:.1f} ± " + ("?" if std is None else f"{std:.1f}")

@@ -87,11 +87,8 @@ class Table:
     def latex(self) -> str:
         """Return the table as LaTeX (booktabs), the notes as comments; the best in bold."""
         body = [[f"\\textbf{{{latex(c.full)}}}" if c.best else latex(c.full) for c in row] for row in self.rows]
-        lines = [" & ".join(row) + r" \\" for row in [[latex(text) for text in self.columns()], *body]]
-        spec = "l" * self.heads + "r" * (len(self.header) - self.heads)
         notes = [f"% {' '.join(note.split())}" for note in (self.title, *self.notes)]
-        top = [*notes, f"\\begin{{tabular}}{{{spec}}}", r"\toprule", lines[0], r"\midrule"]
-        return "\n".join([*top, *lines[1:], r"\bottomrule", r"\end{tabular}"]) + "\n"
+        return "\n".join([*notes, *tabular([latex(text) for text in self.columns()], body, self.heads)]) + "\n"
 
 
 def files(table: Table) -> Mapping[str, bytes]:
@@ -102,6 +99,14 @@ def files(table: Table) -> Mapping[str, bytes]:
 def latex(text: str) -> str:
     """Return text with everything escaped that LaTeX would take for a command."""
     return "".join(SPECIAL.get(character, character) for character in text)
+
+
+def tabular(header: Sequence[str], cells: Sequence[Sequence[str]], names: int) -> list[str]:
+    """Return the lines of a LaTeX table (booktabs) of escaped text; columns after the first `names` align right."""
+    head, *body = [" & ".join(line) + r" \\" for line in [header, *cells]]
+    spec = "l" * names + "r" * (len(header) - names)
+    top = [f"\\begin{{tabular}}{{{spec}}}", r"\toprule", head, r"\midrule"]
+    return [*top, *body, r"\bottomrule", r"\end{tabular}"]
 
 
 def plain(text: str) -> str:

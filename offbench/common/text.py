@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 
 def plural(number: int, noun: str) -> str:
@@ -14,6 +14,12 @@ def plural(number: int, noun: str) -> str:
 def counted(number: int, noun: str) -> str:
     """Return `1 run`, `0 runs` or `1,200 runs`."""
     return f"{number:,} {plural(number, noun)}"
+
+
+def from_to(numbers: Collection[int]) -> str:
+    """Return the least and the largest of some numbers: `3 to 1,200`, or `3` if all are the same."""
+    low, high = min(numbers), max(numbers)
+    return f"{low:,}" if low == high else f"{low:,} to {high:,}"
 
 
 def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], names: int = 1) -> list[str]:

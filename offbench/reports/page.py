@@ -68,7 +68,13 @@ def table(data: Table, *, caption: bool = False, download: bool = True) -> Marku
     for i, (text, below) in enumerate(zip(data.header, small, strict=True)):
         more = [tag("small", breakable(below))] if below else []
         head.append(
-            tag("th", tag("button", breakable(text), type="button"), *more, scope="col", class_=_kind(data, i))
+            tag(
+                "th",
+                tag("button", breakable(text), type="button"),
+                *more,
+                scope="col",
+                class_="name" if i < data.heads else "number",
+            )
         )
     rows = [tag("tr", *[_cell(data, i, cell) for i, cell in enumerate(row)]) for row in data.rows]
     heading = [tag("h4", data.title)] if caption else []
@@ -89,10 +95,6 @@ def table(data: Table, *, caption: bool = False, download: bool = True) -> Marku
         *[tag("p", prose(note), class_="note") for note in data.notes],
         *([tag("p", "This table: ", *files, class_="files")] if download else []),
     )
-
-
-def _kind(data: Table, column: int) -> str:
-    return "name" if column < data.heads else "number"
 
 
 def _cell(data: Table, column: int, cell: Cell) -> Markup:
@@ -143,17 +145,16 @@ def boxes(results: Results) -> list[Markup]:
 
 def _box(results: Results, entry: Entry, name: str) -> Markup:
     task, first = entry.task, entry.runs[0].config
-    commands = dict.fromkeys(trained.config.command or "from Python" for trained in entry.runs)
     references = [f"{REFERENCES[key]}: {pair[0]:g} to {pair[1]:g}" for key, pair in first.references.items() if pair]
     sessions = [session for trained in entry.runs for session in trained.config.history]
     facts = {
         "dataset": f"{task.dataset}, content {task.content}",
         "references": "; ".join(references) or "none",
         "evaluation": f"every {first.eval_every:,} updates, {first.eval_episodes} episodes",
-        "commands": "\n".join(commands),
+        "commands": _several([trained.config.command or "from Python" for trained in entry.runs]),
         "versions": _several([_words(session.versions) for session in sessions]),
         "hardware": _several([_hardware(session) for session in sessions]),
-        "settings": ", ".join(f"{key} {value}" for key, value in first.settings.items()) or "none",
+        "settings": _words(first.settings) or "none",
     }
     title = f"{entry.method.label} on {task.name}"
     terms = [part for key, text in facts.items() for part in (tag("dt", key), tag("dd", breakable(text)))]
@@ -197,8 +198,8 @@ def relative(results: Results, run: Run) -> str:
     return (inside if len(results.roots) == 1 else root.name / inside).as_posix()
 
 
-def _words(values: object) -> str:
-    return ", ".join(f"{key} {value}" for key, value in values.items()) if isinstance(values, Mapping) else "unknown"
+def _words(values: Mapping[str, object]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in values.items())
 
 
 def _hardware(session: Session) -> str:

@@ -18,7 +18,7 @@ from offbench.analysis.results import Folders, Results, read_results
 from offbench.common.errors import OffbenchError
 from offbench.common.files import damage, read_bytes, write_together
 from offbench.common.tables import Table, files
-from offbench.common.text import counted, plural
+from offbench.common.text import counted, from_to, plural
 from offbench.reports import figures as draw
 from offbench.reports import tables
 from offbench.reports.datasets import cards, dataset_table
@@ -63,7 +63,8 @@ def report(
         raise OffbenchError(f"a report is a folder with an {PAGE} in it: give --out {folder.with_suffix('')}")
     results = read_results(runs, datasets=datasets or (), methods=methods or ())
     before = _older(folder)
-    by_name, pictures = _tables(results), _figures(results)
+    aggregates = tables.iqms(results)
+    by_name, pictures = _tables(results, aggregates), _figures(results, aggregates)
     written = {f"tables/{one.name}.{end}": data for one in by_name.values() for end, data in files(one).items()}
     for figure in (figure for group in pictures.values() for figure in group):
         written |= {f"figures/{figure.name}.png": figure.png, f"figures/{figure.name}.svg": figure.svg}
@@ -93,8 +94,7 @@ def _older(folder: Path) -> set[Path]:
     }
 
 
-def _tables(results: Results) -> dict[str, Table]:
-    aggregates = tables.iqms(results)
+def _tables(results: Results, aggregates: tables.Aggregates) -> dict[str, Table]:
     all_tables = [
         *(tables.score_table(results), tables.seed_table(results), dataset_table(results), best_table(results)),
         *(*similarity_tables(results), tables.beside_table(results)),
@@ -104,7 +104,7 @@ def _tables(results: Results) -> dict[str, Table]:
     return {one.name: one for one in all_tables if one}
 
 
-def _figures(results: Results) -> dict[str, list[Figure]]:
+def _figures(results: Results, aggregates: tables.Aggregates) -> dict[str, list[Figure]]:
     """Return all figures by what they show."""
     looks = draw.lines(results.methods)
     rows = [results.on(task) for task in results.tasks]
@@ -116,7 +116,6 @@ def _figures(results: Results) -> dict[str, list[Figure]]:
         for group, column, label in (("beta", "beta", "β"), ("q", "q_abs", "mean |Q1(s, a)|")):
             if figure := draw.loss_figure(entries, looks, f"{group}-{stem}", column, label):
                 groups[group].append(figure)
-    aggregates = tables.iqms(results)
     if aggregates:
         groups["iqm"] = [draw.iqm_figure(aggregates, looks), draw.profile_figure(aggregates, looks)]
     if len(results.tasks) > 1 and aggregates and (over_all := draw.iqm_curve_figure(results, looks)):
@@ -136,14 +135,13 @@ def _stems(names: Sequence[str]) -> list[str]:
 def _lead(results: Results) -> Markup:
     entries = list(results.entries.values())
     runs = [trained for entry in entries for trained in entry.runs]
-    seeds = sorted({len(entry.runs) for entry in entries})
+    seeds = {len(entry.runs) for entry in entries}
     states = Counter(trained.state for trained in runs)
-    each = f"{seeds[0]}" if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
     counts = [
         (f"{len(runs)}", plural(len(runs), "run")),
         (f"{len(results.tasks)}", plural(len(results.tasks), "dataset")),
         (f"{len(results.methods)}", plural(len(results.methods), "method")),
-        (each, f"{plural(seeds[-1], 'seed')} per cell"),
+        (from_to(seeds), f"{plural(max(seeds), 'seed')} per cell"),
         (f"{sum(trained.reached for trained in runs):,}", "updates trained"),
     ]
     tiles = [tag("li", tag("b", value), tag("span", name)) for value, name in counts]

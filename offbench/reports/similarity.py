@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from offbench.analysis.methods import Method
 from offbench.analysis.results import Entry, Results
-from offbench.common.scores import mean_std
+from offbench.common.scores import mean_std, plus_minus
 from offbench.common.tables import Cell, Table
 from offbench.evaluation.similarity import Similarity, read_similarity
-from offbench.reports.tables import NONE, is_papers_grid, plus_minus, published, row_name
+from offbench.reports.tables import NONE, is_papers_grid, published, row_name
 
 
 def similarity_tables(results: Results) -> list[Table]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from offbench.analysis.results import Results
-from offbench.common.scores import mean_std
+from offbench.common.scores import mean_std, plus_minus
 from offbench.common.tables import Cell, Table
-from offbench.reports.tables import NONE, plus_minus, row_name
+from offbench.reports.tables import NONE, row_name
 
 
 def best_table(results: Results) -> Table | None:
@@ -13,9 +15,7 @@ def best_table(results: Results) -> Table | None:
 
     Only scores of evaluations at the same steps are ranked.
     """
-    variants: dict[str, int] = {}
-    for method in results.methods:
-        variants[method.algorithm] = variants.get(method.algorithm, 0) + 1
+    variants = Counter(method.algorithm for method in results.methods)
     algorithms = [name for name, count in variants.items() if count > 1]
     rows = []
     for task in results.tasks:
@@ -26,9 +26,8 @@ def best_table(results: Results) -> Table | None:
                 cells.append(NONE)
                 continue
             best = max(entries, key=lambda entry: mean_std(entry.scores)[0])
-            mean = mean_std(best.scores)
-            of = f"best of {len(entries)}"
-            cells.append(Cell(plus_minus(mean), mean[0], more=f"{best.method.label}, {of}"))
+            score = mean_std(best.scores)
+            cells.append(Cell(plus_minus(score), score[0], more=f"{best.method.label}, best of {len(entries)}"))
         if any(cell is not NONE for cell in cells):
             rows.append([*row_name(results, task), *cells])
     if not rows:

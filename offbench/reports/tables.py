@@ -6,19 +6,21 @@ import csv
 import dataclasses
 import importlib.resources
 from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 from offbench.analysis.compare import comparable, differences, favored, partners
 from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import REFERENCES, Entry, Results, Task, window_words
 from offbench.analysis.statistics import Estimate, Scores, improvement, iqm, paired
-from offbench.common.scores import LAST, mean_std
+from offbench.common.scores import LAST, mean_std, plus_minus
 from offbench.common.tables import Cell, Table
-from offbench.common.text import counted
+from offbench.common.text import counted, from_to
 from offbench.training.run import DIGITS, RunConfig
 
 PAPER = "BDB paper, Table 1"
 PAPER_METHODS = {"td3_bc", "cql", *(f"bdb beta={beta}" for beta in ("0.25", "0.50", "0.75", "adaptive"))}
 NONE = Cell("-")
+Aggregates: TypeAlias = Mapping[Method, tuple[Estimate, Scores]]  # a method's IQM, and the scores that it is of
 FEW_SEEDS = "A task with a single seed has no interval; with few seeds it covers less than 95% (docs/statistics.md)."
 DIFFERENT_DATA = (
     "The datasets are not the same: the published numbers are of D4RL's v0 and v2 files, recorded in older "
@@ -39,12 +41,6 @@ def is_papers_grid(results: Results) -> bool:
     methods = {method.published for method in results.methods}
     cells = {(row["env"], row["level"]) for row in rows}
     return methods >= PAPER_METHODS and all(task.env_and_level in cells for task in results.tasks)
-
-
-def plus_minus(mean_and_std: tuple[float, float | None], digits: int = 1) -> str:
-    """Return `mean ± std`; one seed has no spread, and the text says so."""
-    mean, std = mean_and_std
-    return f"{mean:.{digits}f} ± " + ("?" if std is None else f"{std:.{digits}f}")
 
 
 def score_table(results: Results) -> Table:
@@ -126,8 +122,7 @@ def _best(cells: Sequence[Cell]) -> list[Cell]:
 
 def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
     entries = list(results.entries.values())
-    behind = sorted({entry.evaluations for entry in entries})
-    last = f"{behind[0]}" if len(behind) == 1 else f"{behind[0]} to {behind[-1]}"
+    last = from_to({entry.evaluations for entry in entries})
     over = counted(min(seeds), "seed") if len(seeds) == 1 else "the seeds that each cell names"
     single = " “± ?”: a single seed has no standard deviation." if 1 in seeds else ""
     notes = [
@@ -216,13 +211,13 @@ def beside_table(results: Results) -> Table | None:
     return Table("beside", "Our scores and published scores", header, rows, notes, 3, small)
 
 
-def iqms(results: Results) -> dict[Method, tuple[Estimate, Scores]]:
+def iqms(results: Results) -> Aggregates:
     """Return each method's IQM over the tasks that it has and that have a reference."""
     scores = {method: results.scores(method) for method in results.methods}
     return {method: (iqm(by_task), by_task) for method, by_task in scores.items() if by_task}
 
 
-def iqm_table(results: Results, iqms: Mapping[Method, tuple[Estimate, Scores]]) -> Table:
+def iqm_table(results: Results, iqms: Aggregates) -> Table:
     """Return the IQM of every method with its interval."""
     rows = []
     for method, (estimate, scores) in iqms.items():
@@ -246,7 +241,7 @@ def iqm_table(results: Results, iqms: Mapping[Method, tuple[Estimate, Scores]]) 
     return Table("iqm", "Interquartile mean over tasks", header, rows, notes)
 
 
-def improvement_table(results: Results, iqms: Mapping[Method, tuple[Estimate, Scores]]) -> Table:
+def improvement_table(results: Results, iqms: Aggregates) -> Table:
     """Return the probability that a run of the row's method beats one of the column's, over their common tasks."""
     methods = list(iqms)
     chances: dict[tuple[Method, Method], Estimate] = {}
