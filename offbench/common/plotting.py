@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,18 +16,15 @@ if TYPE_CHECKING:
 FORMATS = ("png", "svg", "pdf")
 
 
-@contextlib.contextmanager
-def figure(panels: int = 1) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Yield (figure, axes of each panel side by side)."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+def figure(panels: int = 1) -> tuple[Figure, list[Axes]]:
+    """Return a figure and the axes of its panels, side by side."""
     from matplotlib.figure import Figure
 
     fig = Figure(figsize=(6.4 * panels, 4.0), layout="constrained")
-    FigureCanvasAgg(fig)
     axes = [fig.add_subplot(1, panels, i + 1) for i in range(panels)]
     for panel in axes:
         panel.spines[["top", "right"]].set_visible(False)
-    yield fig, axes
+    return fig, axes
 
 
 def picture_file(path: str | Path) -> Path:

@@ -241,21 +241,21 @@ def _draw(recipe: Recipe, ladder: Ladder, levels: Mapping[str, Summary], path: P
     with open(ladder.folder / "ladder.csv", newline="", encoding="utf-8") as file:
         rows = [{key: row[key] for key in ("step", "return", "deterministic_return")} for row in csv.DictReader(file)]
     steps = [int(row["step"]) for row in rows]
-    with figure(2) as (fig, (left, right)):
-        for key, name, color in (("return", "sampled", BLUE), ("deterministic_return", "deterministic", "#9ab8d6")):
-            left.plot(steps, [float(row[key]) for row in rows], color=color, linewidth=1, label=name)
-        kept = ladder.rungs
-        left.plot([r.step for r in kept], [r.ret for r in kept], "o", markersize=4, color=RED, label="kept")
-        left.set(xlabel="environment steps", ylabel="return", title=f"SAC on {recipe.env_id}")
-        left.legend(frameon=False)
-        low = min(float(summary.returns.min()) for summary in levels.values())
-        high = max(float(summary.returns.max()) for summary in levels.values())
-        edges = np.linspace(low, high, BINS + 1)
-        for bottom, summary in enumerate(levels.values()):
-            counts, _ = np.histogram(summary.returns, edges)
-            # a square root, so that rare returns stay visible beside the frequent ones
-            right.stairs(bottom + 0.85 * np.sqrt(counts / counts.max()), edges, baseline=bottom, fill=True, color=BLUE)
-            right.plot([summary.returns.mean()] * 2, [bottom, bottom + 0.85], color=RED, linewidth=1.2)
-        right.set_yticks(np.arange(len(levels)) + 0.3, list(levels))
-        right.set(xlabel="return", title="episodes by return (root scale; line: mean)")
-        save(fig, path)
+    fig, (left, right) = figure(2)
+    for key, name, color in (("return", "sampled", BLUE), ("deterministic_return", "deterministic", "#9ab8d6")):
+        left.plot(steps, [float(row[key]) for row in rows], color=color, linewidth=1, label=name)
+    kept = ladder.rungs
+    left.plot([r.step for r in kept], [r.ret for r in kept], "o", markersize=4, color=RED, label="kept")
+    left.set(xlabel="environment steps", ylabel="return", title=f"SAC on {recipe.env_id}")
+    left.legend(frameon=False)
+    low = min(float(summary.returns.min()) for summary in levels.values())
+    high = max(float(summary.returns.max()) for summary in levels.values())
+    edges = np.linspace(low, high, BINS + 1)
+    for bottom, summary in enumerate(levels.values()):
+        counts, _ = np.histogram(summary.returns, edges)
+        # a square root, so that rare returns stay visible beside the frequent ones
+        right.stairs(bottom + 0.85 * np.sqrt(counts / counts.max()), edges, baseline=bottom, fill=True, color=BLUE)
+        right.plot([summary.returns.mean()] * 2, [bottom, bottom + 0.85], color=RED, linewidth=1.2)
+    right.set_yticks(np.arange(len(levels)) + 0.3, list(levels))
+    right.set(xlabel="return", title="episodes by return (root scale; line: mean)")
+    save(fig, path)

@@ -62,12 +62,12 @@ class Summary:
         from offbench.common.plotting import figure, picture_file, save
 
         path = picture_file(path)
-        with figure() as (fig, (axes,)):
-            axes.hist(self.returns, bins=40, color="#3b6ea5")
-            axes.axvline(self.returns.mean(), color="#c44", linewidth=1.2, label=f"mean {self.returns.mean():.0f}")
-            axes.set(xlabel="return", ylabel="episodes", title=self.dataset_id)
-            axes.legend(frameon=False)
-            return save(fig, path)
+        fig, (axes,) = figure()
+        axes.hist(self.returns, bins=40, color="#3b6ea5")
+        axes.axvline(self.returns.mean(), color="#c44", linewidth=1.2, label=f"mean {self.returns.mean():.0f}")
+        axes.set(xlabel="return", ylabel="episodes", title=self.dataset_id)
+        axes.legend(frameon=False)
+        return save(fig, path)
 
 
 def show(dataset_id: str) -> Summary:

@@ -18,11 +18,12 @@ import numpy as np
 
 from offbench.analysis.methods import Method
 from offbench.analysis.results import REFERENCES, Entry, Results, Task, read_results
-from offbench.analysis.statistics import Estimate, Scores, curve, iqm, profile
+from offbench.analysis.statistics import Estimate, curve, iqm, profile
 from offbench.common.arrays import Array
 from offbench.common.plotting import figure, picture_file, save
 from offbench.common.scores import LAST
 from offbench.common.text import compact
+from offbench.reports.tables import Aggregates
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,31 +80,23 @@ def lines(methods: Sequence[Method]) -> dict[Method, Line]:
 def curve_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str) -> Figure:
     """Draw one task's learning curves: mean over seeds with its 95% interval (the paper's Figure 4)."""
     task = entries[0].task
-    ends: list[str] = []
-
-    def paint(axes: Axes) -> None:
-        ends.extend(_paint_curves(axes, entries, looks))
-
-    def alt() -> str:
-        return f"Learning curves on {task.name}. At the last common evaluation: {', '.join(dict.fromkeys(ends))}."
-
+    curves = {entry.method.label: entry.drawn_curve() for entry in entries}
+    ends = [f"{label} {values.mean(0)[-1]:.1f}" for label, (steps, values) in curves.items() if steps]
+    alt = f"Learning curves on {task.name}. At the last common evaluation: {', '.join(ends)}."
     caption = "Mean over seeds, 95% bootstrap interval shaded."
     if any(entry.smoothed for entry in entries):
         caption += f" Each point is the mean of the last {LAST} evaluations up to it."
-    return _draw(name, caption, alt, paint, [looks[entry.method] for entry in entries])
+    shown = [looks[entry.method] for entry in entries]
+    return _draw(name, caption, alt, lambda axes: _paint_curves(axes, entries, looks), shown)
 
 
-def _paint_curves(axes: Axes, entries: Sequence[Entry], looks: Mapping[Method, Line]) -> list[str]:
-    """Draw one task's learning curves; return each method with its last score."""
-    ends = []
+def _paint_curves(axes: Axes, entries: Sequence[Entry], looks: Mapping[Method, Line]) -> None:
+    """Draw one task's learning curves."""
     for entry in entries:
         steps, values = entry.drawn_curve()
         if steps:
-            points = curve(values)
-            _band(axes, steps, points, looks[entry.method])
-            ends.append(f"{entry.method.label} {points[-1].value:.1f}")
+            _band(axes, steps, curve(values), looks[entry.method])
     axes.set(xlabel="updates", ylabel=_unit(entries[0].task), title=shortened(entries[0].task.name, 44))
-    return ends
 
 
 def plot_curves(runs: str | Path, path: str | Path) -> Path:
@@ -117,7 +110,8 @@ def plot_curves(runs: str | Path, path: str | Path) -> Path:
     path = picture_file(path)
     results = read_results(runs)
     looks = lines(results.methods)
-    with mpl.rc_context(_style(path.stem)), figure(len(results.tasks)) as (fig, panels):
+    with mpl.rc_context(_style(path.stem)):
+        fig, panels = figure(len(results.tasks))
         for axes, task in zip(panels, results.tasks, strict=True):
             entries = results.on(task)
             _paint_curves(axes, entries, looks)
@@ -143,7 +137,7 @@ def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
     )
 
 
-def iqm_figure(iqms: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[Method, Line]) -> Figure:
+def iqm_figure(iqms: Aggregates, looks: Mapping[Method, Line]) -> Figure:
     """Draw every method's IQM with its interval."""
 
     def paint(axes: Axes) -> None:
@@ -160,7 +154,7 @@ def iqm_figure(iqms: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[Me
     return _draw("iqm", caption, f"Interquartile means with 95% intervals: {text}.", paint)
 
 
-def profile_figure(iqms: Mapping[Method, tuple[Estimate, Scores]], looks: Mapping[Method, Line]) -> Figure:
+def profile_figure(iqms: Aggregates, looks: Mapping[Method, Line]) -> Figure:
     """Draw the performance profiles: the fraction of runs above each score."""
     every = [value for _, scores in iqms.values() for values in scores.values() for value in values]
     taus = np.linspace(min(0.0, min(every)), max(100.0, max(every)), PROFILE_POINTS)
@@ -207,13 +201,10 @@ def loss_figure(
     entries: Sequence[Entry], looks: Mapping[Method, Line], name: str, column: str, label: str
 ) -> Figure | None:
     """Draw a column of losses.csv over training: mean over seeds, their range shaded; None if no run has it."""
-    task, ends, shown = entries[0].task, [], []
+    task = entries[0].task
     series = {entry.method: one for entry in entries if (one := _column(entry, column))}
     if not series:
         return None
-    for method, (steps, values) in series.items():
-        ends.append(f"{method.label} {values.mean(0)[-1]:.3g} at {steps[-1]:,}")
-        shown.append(looks[method])
 
     def paint(axes: Axes) -> None:
         for method, (steps, values) in series.items():
@@ -224,8 +215,9 @@ def loss_figure(
             axes.set_ylim(-0.03, 1.03)
         axes.set(xlabel="updates", ylabel=label, title=shortened(task.name, 44))
 
+    ends = [f"{method.label} {values.mean(0)[-1]:.3g} at {steps[-1]:,}" for method, (steps, values) in series.items()]
     alt = f"{label} over training on {task.name}. At the end: {', '.join(ends)}."
-    return _draw(name, "Mean over seeds, range shaded.", alt, paint, shown)
+    return _draw(name, "Mean over seeds, range shaded.", alt, paint, [looks[method] for method in series])
 
 
 def _column(entry: Entry, column: str) -> tuple[list[int], Array] | None:
@@ -277,17 +269,12 @@ def _unit(task: Task) -> str:
     return "return" if task.reference is None else f"normalized score ({REFERENCES[task.reference]})"
 
 
-def _draw(
-    name: str,
-    caption: str,
-    alt: str | Callable[[], str],
-    paint: Callable[[Axes], None],
-    legend: Sequence[Line] = (),
-) -> Figure:
-    """Draw a figure and keep it three ways. `alt` may be a function, called after the painting."""
+def _draw(name: str, caption: str, alt: str, paint: Callable[[Axes], None], legend: Sequence[Line] = ()) -> Figure:
+    """Draw a figure and keep it three ways."""
     import matplotlib as mpl
 
-    with mpl.rc_context(_style(name)), figure() as (fig, (axes,)):
+    with mpl.rc_context(_style(name)):
+        fig, (axes,) = figure()
         fig.set_size_inches(*SIZE)
         fig.patch.set_alpha(0)
         axes.patch.set_alpha(0)
@@ -301,7 +288,7 @@ def _draw(
             fig.set_size_inches(SIZE[0], SIZE[1] + 0.2 * ((len(legend) + 1) // 2))
             fig.legend(*_legend(legend), loc="outside lower center", ncols=2, frameon=False, fontsize="small")
         png, svg = _saved(fig, "png"), _saved(fig, "svg")
-    return Figure(name, caption, alt() if callable(alt) else alt, png, svg, _for_page(inline, name), tuple(legend))
+    return Figure(name, caption, alt, png, svg, _for_page(inline, name), tuple(legend))
 
 
 def _style(name: str) -> Any:
@@ -333,6 +320,6 @@ def _for_page(svg: str, name: str) -> str:
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>|<style .*?</style>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", svg)
-    svg = re.sub(r' width="[^"]*pt" height="[^"]*pt"| height="[^"]*pt"| width="[^"]*pt"', "", svg, count=2)
+    svg = re.sub(r' (width|height)="[^"]*pt"', "", svg, count=2)
     svg = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px system-ui, sans-serif", svg)
     return svg.replace(INK, "currentColor").replace("<svg ", '<svg role="img" aria-hidden="true" ', 1)
