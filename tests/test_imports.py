@@ -136,8 +136,8 @@ from offbench.rollouts.rollouts import Rollouts
 with Rollouts(env_spec("InvertedPendulum-v5"), workers=1) as rollouts:
     policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     print(len(rollouts.outcomes(policy, 0, (), 3, True).result()), "episodes")
-    from offbench.common.processes import loaded
-    print("worker has", rollouts._pool.submit(loaded, ("torch", "stable_baselines3")).result())
+    loaded = "set(__import__('sys').modules) & {'torch', 'stable_baselines3'}"
+    print("worker has", list(rollouts._pool.submit(eval, loaded).result()))
 """
     )
     done = subprocess.run([sys.executable, "script.py"], check=True, cwd=home, capture_output=True, text=True)

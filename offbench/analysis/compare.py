@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from offbench.analysis.methods import find_method
 from offbench.analysis.results import REFERENCES, Entry, Task, Trained, read_results, window_words
 from offbench.analysis.statistics import Estimate, Paired, improvement, paired
 from offbench.common.errors import OffbenchError
@@ -143,7 +144,7 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
         OffbenchError: no such group, the two are one, or they share no dataset and seed.
     """
     results = read_results(runs)
-    groups = tuple(results.of(results.method(name)) for name in (a, b))
+    groups = tuple(results.of(find_method(results.methods, name)) for name in (a, b))
     if groups[0] == groups[1]:
         raise OffbenchError(f"{a} and {b} are the same runs; give two groups")
     both = partners(*groups)

@@ -122,7 +122,11 @@ def unnamed_settings(methods: Iterable[Method]) -> list[str]:
 
 
 def find_method(methods: Sequence[Method], name: str) -> Method:
-    """Return the method of a name. See `Results.method`."""
+    """Return the method of a name: as in a table, ALGO/VARIANT, or ALGO for its default or only variant.
+
+    Raises:
+        OffbenchError: no such method here, or the algorithm has several variants.
+    """
     name = re.sub(r" \([\d,]+( of [\d,]+)? steps\)$", "", " ".join(name.split()))  # as in a column's heading
     for matches in ([m for m in methods if m.label == name], [m for m in methods if name in m.spellings]):
         if len(matches) == 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
 from collections.abc import Collection, Iterable, Sequence
@@ -49,14 +50,11 @@ def score_some(runs: Iterable[Run]) -> list[Row]:
 
 def count_waiting(runs: str | Path) -> int:
     """Return how many runs below a folder have no evaluation yet; damaged ones are not counted."""
-    return sum(map(_is_waiting, find_runs(Path(runs))))
-
-
-def _is_waiting(run: Run) -> bool:
-    try:
-        return not run.evaluations()
-    except (OffbenchError, OSError):
-        return False
+    count = 0
+    for run in find_runs(Path(runs)):
+        with contextlib.suppress(OffbenchError, OSError):
+            count += not run.evaluations()
+    return count
 
 
 def _rows(entries: Collection[Entry]) -> list[Row]:

@@ -210,14 +210,6 @@ class Results:
         """Return whether all scores of a task are of evaluations at the same steps: others must not be ranked."""
         return len({trained.window for entry in self.on(task) for trained in entry.runs}) == 1
 
-    def method(self, name: str) -> Method:
-        """Return the method of a name: as in a table, ALGO/VARIANT, or ALGO for its default or only variant.
-
-        Raises:
-            OffbenchError: no such method here, or the algorithm has several variants.
-        """
-        return find_method(self.methods, name)
-
     def scores(self, method: Method) -> dict[str, list[float]]:
         """Return {task: normalized scores of its seeds}; tasks without a reference are left out."""
         return {entry.task.name: entry.scores for entry in self.of(method) if entry.task.reference}

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from offbench.common.errors import OffbenchError
@@ -112,11 +112,6 @@ def start_worker(parent: int, closing: c_byte | None = None) -> None:
 def closing() -> bool:
     """Return whether the pool of this worker is closing, so that its results are not needed."""
     return _Worker.closing is not None and bool(_Worker.closing.value)
-
-
-def loaded(names: Sequence[str]) -> list[str]:
-    """Return which of these modules are loaded in this process (a worker should not have PyTorch)."""
-    return [name for name in names if name in sys.modules]
 
 
 def _watch(parent: int) -> None:

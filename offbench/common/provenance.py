@@ -6,6 +6,7 @@ import functools
 import importlib.metadata
 import os
 import platform
+import re
 from pathlib import Path
 from typing import TypedDict
 
@@ -54,18 +55,17 @@ def made_with(device: str, precision: str) -> MadeWith:
 
 def has_bfloat16() -> bool:
     """Return whether this processor multiplies bfloat16 numbers natively: AVX512_BF16, AMX, or ARM's BF16 (Linux)."""
-    try:
-        text = Path("/proc/cpuinfo").read_text()
-    except OSError:
-        return False
-    return bool({"avx512_bf16", "amx_bf16", "bf16"} & set(text.split()))
+    return bool({"avx512_bf16", "amx_bf16", "bf16"} & set(_cpuinfo().split()))
 
 
 def _processor() -> str:
+    name = re.search(r"^model name.*?: *(.*)", _cpuinfo(), re.MULTILINE)
+    return name[1].strip() if name else platform.processor() or "unknown"
+
+
+def _cpuinfo() -> str:
+    """Return what Linux says of the processor; "" on other systems."""
     try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
+        return Path("/proc/cpuinfo").read_text()
     except OSError:
-        pass
-    return platform.processor() or "unknown"
+        return ""

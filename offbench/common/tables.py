@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from offbench.common.files import csv_bytes
 from offbench.common.text import no_formula
@@ -66,7 +66,7 @@ class Table:
     rows: Sequence[Sequence[Cell]]
     notes: Sequence[str] = ()
     heads: int = 1
-    small: Sequence[str] = field(default=())
+    small: Sequence[str] = ()
 
     def columns(self) -> list[str]:
         """Return each column's whole header on one line."""

@@ -7,7 +7,7 @@ import importlib.resources
 import re
 from pathlib import Path
 
-from offbench.analysis.results import Results, Task, Trained
+from offbench.analysis.results import Results, Task
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, read_json
 from offbench.common.tables import Cell, Table
@@ -25,15 +25,10 @@ def dataset_table(results: Results) -> Table:
     for task in results.tasks:
         runs = [trained for entry in results.on(task) for trained in entry.runs]
         envs = sorted({trained.config.env_id for trained in runs} - {""})
-        rows.append(
-            [
-                Cell(task.dataset),
-                Cell(", ".join(envs) or "-"),
-                *_sizes(task),
-                Cell(_scale(runs[0]) or "-"),
-                Cell(task.content[:SHOWN]),
-            ]
-        )
+        references = runs[0].config.references.get("dataset")
+        scale = f"{references[0]:,.1f} to {references[1]:,.1f}" if references else "-"
+        names = [Cell(task.dataset), Cell(", ".join(envs) or "-")]
+        rows.append([*names, *_sizes(task), Cell(scale), Cell(task.content[:SHOWN])])
     header = ["dataset", "environment", "transitions", "episodes", "mean return", "score 0 to 100", "content"]
     notes = [
         "“content”: the first digits of the SHA-256 over a dataset's arrays, as each run's config.json has it. Sizes "
@@ -41,12 +36,6 @@ def dataset_table(results: Results) -> Table:
         "to 100”: the returns of the random policy and of the expert that came with the dataset."
     ]
     return Table("datasets", "Datasets that the runs were trained on", header, rows, notes, 2)
-
-
-def _scale(trained: Trained) -> str:
-    """Return a run's references in words, "" if its dataset has none."""
-    pair = trained.config.references.get("dataset")
-    return f"{pair[0]:,.1f} to {pair[1]:,.1f}" if pair else ""
 
 
 def _sizes(task: Task) -> list[Cell]:

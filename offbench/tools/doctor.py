@@ -24,7 +24,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import read_json
 from offbench.common.processes import cores
 from offbench.common.provenance import hardware, versions
-from offbench.data import minari_store
+from offbench.data import minari_store, transitions
 from offbench.envs.environments import make_env
 from offbench.envs.recipes import load_recipe
 from offbench.rollouts.rollouts import Episode
@@ -68,7 +68,7 @@ def doctor() -> list[Finding]:
         "physics": _physics,
         "algorithms": _algorithms,
         "datasets": lambda: _writable(minari_store.root(), "MINARI_DATASETS_PATH"),
-        "cache": _cache,
+        "cache": lambda: _writable(transitions.cache(), "OFFBENCH_CACHE"),
         "runs": lambda: _writable(Path.cwd(), ""),
         "renderer": _renderer,
         "extras": _extras,
@@ -169,12 +169,6 @@ def _algorithms() -> Iterator[tuple[str, str]]:
         except OffbenchError as error:
             yield BROKEN, str(error)
     yield (OK, ", ".join(loaded)) if loaded else (BROKEN, "none is registered; install the package: pip install .")
-
-
-def _cache() -> Iterator[tuple[str, str]]:
-    from offbench.data.transitions import cache
-
-    return _writable(cache(), "OFFBENCH_CACHE")
 
 
 def _writable(folder: Path, variable: str) -> Iterator[tuple[str, str]]:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import offbench
+from offbench.analysis.methods import find_method
 from offbench.analysis.results import read_results
 from offbench.benchmarks.benchmark import LocalExecutor, benchmark, shard_of
 from offbench.benchmarks.grid import load_grid, shipped_grids
@@ -118,7 +119,7 @@ def test_settings_of_each_dataset_are_one_column(home: Path) -> None:
     assert rows == [("a-v0", "tuned", "learning_rate=0.001"), ("b-v0", "tuned", "learning_rate=0.0001")]
     results = read_results("runs")
     assert score_table(results).header == ["level", "environment", "tuned"]
-    assert list(results.scores(results.method("tuned"))) == ids
+    assert list(results.scores(find_method(results.methods, "tuned"))) == ids
 
 
 def test_a_finished_grid_is_left_alone(grid: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
