@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -85,13 +86,24 @@ def forget_modules(folder: Path) -> None:
             del sys.modules[name]
 
 
-@pytest.fixture
-def medium(tiny: tuple[str, str]) -> str:
-    """The id of a small dataset of the tiny recipe."""
+@pytest.fixture(scope="session")
+def recorded(tiny: tuple[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A Minari folder with a small dataset of the tiny recipe."""
     import offbench
 
-    recipe, behaviour_dir = tiny
-    return offbench.collect(recipe, "medium", behaviour_dir=behaviour_dir, workers=1)
+    folder = tmp_path_factory.mktemp("recorded")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
+        patch.setenv("OFFBENCH_CACHE", str(folder / "cache"))
+        offbench.collect(tiny[0], "medium", behaviour_dir=tiny[1], workers=1)
+    return folder / "minari"
+
+
+@pytest.fixture
+def medium(recorded: Path, home: Path) -> str:
+    """The id of a copy of that dataset in the test's own Minari folder."""
+    shutil.copytree(recorded, home / "minari", dirs_exist_ok=True)
+    return "tiny-medium-v0"
 
 
 @pytest.fixture

@@ -18,50 +18,52 @@ from tests.made_runs import made_run
 Cli = Callable[..., subprocess.CompletedProcess[str]]
 
 
-@pytest.fixture
-def offered(home: Path) -> Callable[[str], list[str]]:
-    """What is offered at the end of a line, as argcomplete's bash function asks for it: the answer is on fd 8."""
+OFFERED = {  # line: what is offered at its end
+    "offbench coll": ["collect"],
+    "offbench collect hop": ["hopper"],
+    "offbench collect hopper --level medium-": ["medium-replay", "medium-expert"],
+    "offbench collect hopper --le": ["--level"],
+    "offbench benchmark paper-": ["paper-small"],
+    "offbench normalize --format l": ["latex"],
+    "offbench train td3_bc --be": [],
+    "offbench train bdb --be": ["--beta", "--beta-scope"],
+    "offbench train bdb --beta ad": ["adaptive"],
+    "offbench train bdb --dataset my": ["my-data-v0"],
+    "offbench show mujoco/h": ["mujoco/hopper/medium-v0"],
+    # the shell needs its own special characters escaped
+    "offbench compare bdb": ["bdb\\ \\(beta=0.5\\)", "bdb\\ \\(beta=0.75\\)"],
+}
+# asks as argcomplete's bash function does: the answer is on fd 8; a fork for each line saves its imports
+ASK = """
+import os, sys, torch
+from offbench.analysis import results
+from offbench.cli.main import main
 
-    def ask(line: str) -> list[str]:
-        answer = home / "answer"
-        asked = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "COMP_LINE": line, "COMP_POINT": str(len(line))}
-        command = f"{sys.executable} -m offbench 8>{answer} 9>/dev/null"
-        done = subprocess.run(
-            ["bash", "-c", command],
-            env=os.environ | asked | {"_ARGCOMPLETE_SUPPRESS_SPACE": "1"},
-            capture_output=True,
-            text=True,
-            cwd=home,
-            check=False,
-        )
-        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-        return answer.read_text().splitlines()
-
-    return ask
+for number, line in enumerate(sys.argv[1:]):
+    if os.fork() == 0:
+        os.dup2(os.open(f"answer-{number}", os.O_WRONLY | os.O_CREAT), 8)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 9)
+        os.environ |= {"COMP_LINE": line, "COMP_POINT": str(len(line))}
+        main([])
+    os.wait()
+"""
 
 
-@pytest.mark.skipif(not shutil.which("bash"), reason="no bash here")
-def test_what_is_offered(offered: Callable[[str], list[str]], home: Path) -> None:
-    assert set(offered("offbench ")) >= set(BY_NAME)
-    assert offered("offbench coll") == ["collect"]
-    assert offered("offbench collect hop") == ["hopper"]
-    assert offered("offbench collect hopper --level medium-") == ["medium-replay", "medium-expert"]
-    assert offered("offbench collect hopper --le") == ["--level"]
-    assert [word for word in offered("offbench train ") if not word.startswith("-")] == algorithm_names()
-    assert offered("offbench benchmark paper-") == ["paper-small"]
-    assert offered("offbench normalize --format l") == ["latex"]
-    assert "--beta" in offered("offbench train bdb --b")
-    assert "--beta" not in offered("offbench train td3_bc --b")
-    assert offered("offbench train bdb --beta ad") == ["adaptive"]
+def test_what_is_offered(home: Path) -> None:
     for dataset in ("my-data-v0", "mujoco/hopper/medium-v0"):
         (home / "minari" / dataset / "data").mkdir(parents=True)
         (home / "minari" / dataset / "data" / "metadata.json").write_text("{}")
-    assert offered("offbench train bdb --dataset my") == ["my-data-v0"]
-    assert offered("offbench show mujoco/h") == ["mujoco/hopper/medium-v0"]
     for variant in ("beta=0.5", "beta=0.75"):
         made_run(home / "runs", "hopper-medium-v0", "bdb", variant, 0, 50)
-    # the shell needs its own special characters escaped
-    assert offered("offbench compare bdb") == ["bdb\\ \\(beta=0.5\\)", "bdb\\ \\(beta=0.75\\)"]
+    lines = ["offbench ", "offbench train ", *OFFERED]
+    shell = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_SUPPRESS_SPACE": "1"}
+    command = [sys.executable, "-W", "ignore", "-c", ASK, *lines]
+    done = subprocess.run(command, env=os.environ | shell, capture_output=True, text=True, cwd=home, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    commands, algorithms, *answers = ((home / f"answer-{i}").read_text().splitlines() for i in range(len(lines)))
+    assert set(commands) >= set(BY_NAME)
+    assert [word for word in algorithms if not word.startswith("-")] == algorithm_names()
+    assert dict(zip(OFFERED, answers, strict=True)) == OFFERED
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
