@@ -27,7 +27,7 @@ from offbench.agents.medium_replay import replay_episodes, save_replay
 from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, csv_bytes, damage, disk_errors, read_json, write_bytes, write_json
-from offbench.common.provenance import versions
+from offbench.common.provenance import PHYSICS, versions
 from offbench.common.seeds import Purpose
 from offbench.common.terminal import inform
 from offbench.envs.environments import make_env, spaces_of
@@ -86,7 +86,7 @@ class RungEvaluator:
 
     def _made(self) -> dict[str, str | int]:
         episodes = self.folder.recipe.measure.rung_episodes
-        return {name: versions()[name] for name in ("mujoco", "gymnasium", "numpy")} | {"episodes": episodes}
+        return {name: versions()[name] for name in PHYSICS} | {"episodes": episodes}
 
     def measure(self, step: int) -> float:
         """Return the mean return of a policy over the recipe's `rung_episodes`."""

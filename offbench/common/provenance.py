@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TypedDict
 
 PACKAGES = ("offbench", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "minari")
+PHYSICS = ("mujoco", "gymnasium", "numpy")  # packages whose version can change recorded data
 Hardware = dict[str, str | int | None]
 
 

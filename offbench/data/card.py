@@ -20,7 +20,7 @@ import numpy as np
 from offbench.agents.ladder import BEHAVIOUR, Ladder, find_ladder
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, read_json, write_bytes, write_json
-from offbench.common.provenance import versions
+from offbench.common.provenance import PHYSICS, versions
 from offbench.common.scores import normalize
 from offbench.common.tables import markdown
 from offbench.common.terminal import warn
@@ -29,7 +29,6 @@ from offbench.data.levels import LEVELS, full_size
 from offbench.data.show import Summary, show
 from offbench.envs.recipes import Recipe, load_recipe
 
-DECIDE = ("mujoco", "gymnasium", "numpy")  # packages whose version can change the recorded data
 BINS = 50
 BLUE, RED = "#3b6ea5", "#c4443c"
 
@@ -63,7 +62,7 @@ def card(env: str, out: str | Path | None = None, behaviour_dir: str | Path = BE
     if sorted(means) != means:
         warn(f"the levels of {recipe.name} are out of order: {means}")
     folder = Path(out or f"{recipe.name}-card")
-    made = {name: versions()[name] for name in DECIDE}
+    made = {name: versions()[name] for name in PHYSICS}
     _keep_hashes(recipe, facts, made["mujoco"])
     write_json(folder / "card.json", {"format": "offbench-card-2", "versions": made, "levels": facts})
     _draw(recipe, ladder, levels, folder / "card.png")
@@ -76,11 +75,8 @@ def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
 
     None if there is no card, or if the level is not one of the five.
     """
-    path = recipe.folder / "card.json" if recipe.folder else None
-    if path is None or not path.exists():
-        return None
-    card = read_json(path)
-    if level not in card["levels"]:
+    card = _shipped_card(recipe)
+    if card is None or level not in card["levels"]:
         return None
     contents = card["levels"][level]["content_sha256"]
     if content_sha256 in contents.values():
@@ -96,13 +92,18 @@ def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
     return f"warning: content differs from the dataset card's, {reason}"
 
 
+def _shipped_card(recipe: Recipe) -> JsonObject | None:
+    path = recipe.folder / "card.json" if recipe.folder else None
+    return read_json(path) if path is not None and path.exists() else None
+
+
 def _keep_hashes(recipe: Recipe, facts: dict[str, JsonObject], mujoco: str) -> None:
     """Add the shipped card's content hashes of other MuJoCo versions to each level, if it describes the same ladder.
 
     The content of medium-replay shows it: it comes from training, so it is the same on every MuJoCo version.
     """
-    path = recipe.folder / "card.json" if recipe.folder else None
-    shipped = read_json(path)["levels"] if path is not None and path.exists() else {}
+    card = _shipped_card(recipe)
+    shipped = card["levels"] if card else {}
     same = shipped and facts["medium-replay"]["content_sha256"] in shipped["medium-replay"]["content_sha256"].values()
     for level, values in facts.items():
         others = shipped[level]["content_sha256"] if same else {}

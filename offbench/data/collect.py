@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import json
@@ -15,7 +16,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, sha256
 from offbench.common.processes import default_workers
 from offbench.common.progress import Progress
-from offbench.common.provenance import versions
+from offbench.common.provenance import PHYSICS, versions
 from offbench.common.terminal import inform
 from offbench.data import minari_store
 from offbench.data.behaviour_policy import BehaviourPolicy, level_name, read_behaviour_policy
@@ -34,7 +35,6 @@ POLICY = "policy"  # the source of a part that a user's own policy plays
 AGENTLESS = ("uniform", POLICY)  # sources that need no behaviour agent
 # two recordings with the same values of these metadata, on the same versions of these packages, are the same
 IDENTITY = ("env", "level", "seed", "recipe_sha256", "parts", "references")
-PHYSICS = ("mujoco", "gymnasium", "numpy")
 HOME = "https://github.com/offbench/offbench"
 
 
@@ -60,9 +60,9 @@ def collect(
         env: a shipped recipe's name (`hopper`) or a recipe file (`./my-env.toml`).
         level: random, medium, medium-replay, medium-expert, expert, or a fraction such as "0.6".
         mix: a blend instead of a level, e.g. "random:0.5,expert:0.5".
-        steps: transitions; default: the recipe's (1,000,000 a part; medium-replay what training gave).
+        steps: transitions; default: the recipe's (1,000,000 per part; medium-replay: all of the training's).
         seed: of the recorded episodes. The same seed gives the same content for any number of workers.
-        workers: recording processes (default: one a core).
+        workers: recording processes (default: one per core).
         dataset_id: the Minari id; default `<env>-<level>-v<version>`.
         overwrite: replace a dataset of that id. Without it, the same dataset recorded again is left as it is, and
             another one is an error.
@@ -171,15 +171,16 @@ class _Recording:
     def __init__(
         self, recipe: Recipe, ladder: Ladder | None, seed: int, workers: int, given: str | None = None
     ) -> None:
-        self.recipe, self._ladder, self.seed, self.workers = recipe, ladder, seed, workers
+        self.recipe, self._ladder, self.seed = recipe, ladder, seed
+        self.workers = workers if workers > 1 else 0  # a single one would be no faster than this process
         self.spec = recipe.env_spec()
         env = make_env(self.spec)
         self.mujoco = model_of(env) is not None
-        self.spaces = self.observation_space, self.action_space = spaces_of(env, recipe.env_id)
+        self.spaces = self.observation_space, action_space = spaces_of(env, recipe.env_id)
+        self.bounds = action_space.low, action_space.high
         self.given: BehaviourPolicy | None = None
         if given is not None:
-            low, high = self.action_space.low, self.action_space.high
-            self.given = read_behaviour_policy(given, low, high, self.observation_space.shape[0], recipe.env_id)
+            self.given = read_behaviour_policy(given, *self.bounds, self.observation_space.shape[0], recipe.env_id)
 
     @property
     def ladder(self) -> Ladder:
@@ -192,7 +193,7 @@ class _Recording:
         """The random and the expert reference; without a ladder the random one, measured here as a ladder's is."""
         if self._ladder:
             return dict(self._ladder.info.references)
-        with Rollouts(self.spec, self.workers if self.workers > 1 else 0) as rollouts:
+        with Rollouts(self.spec, self.workers) as rollouts:
             return {"random": random_reference(self.recipe, 0, rollouts)}
 
     def source(self, part: Part, accept: bool) -> Rung | None:
@@ -242,25 +243,20 @@ class _Recording:
             return self.given.policy
         if rung is not None:
             return self.ladder.load(rung)
-        low, high = self.action_space.low, self.action_space.high
-        return uniform(low, high, self.observation_space.shape[0], self.recipe.env_id)
+        return uniform(*self.bounds, self.observation_space.shape[0], self.recipe.env_id)
 
     def episodes(self, part: Part, rung: Rung | None, count: int, index: int) -> Iterator[Episode]:
         """Yield a part's episodes, exactly `count` transitions: the last one is cut."""
         if part.source == "replay":
-            low, high = self.action_space.low, self.action_space.high
-            expected = self.ladder.info.medium_replay.sha256
-            yield from cut_at(
-                load_replay(self.ladder.replay, expected, low, high, self.observation_space.dtype), count
-            )
+            expected, dtype = self.ladder.info.medium_replay.sha256, self.observation_space.dtype
+            yield from cut_at(load_replay(self.ladder.replay, expected, *self.bounds, dtype), count)
             return
-        with Rollouts(self.spec, self.workers if self.workers > 1 else 0) as rollouts:
+        with (
+            Rollouts(self.spec, self.workers) as rollouts,
             # the part is in the seed, so that both halves of medium-expert have their own episodes
-            endless = rollouts.episodes(self.policy(rung), self.seed, (index,), enough=count)
-            try:
-                yield from cut_at(endless, count)
-            finally:
-                endless.close()  # type: ignore[attr-defined]
+            contextlib.closing(rollouts.episodes(self.policy(rung), self.seed, (index,), enough=count)) as endless,
+        ):
+            yield from cut_at(endless, count)
 
     def words(self, part: Part, rung: Rung | None) -> str:
         """Return what a part is recorded from, for the dataset's description."""
@@ -327,15 +323,15 @@ def _metadata(
     full, total = _full_size(recipe, recording._ladder, parts), sum(counts)
     short = f" A short recording: {total:,} of {full:,} transitions." if total < full else ""
     words = [recording.words(part, rung) for part, rung in zip(parts, sources, strict=True)]
+    if recording.given:
+        algorithm = recording.given.algorithm
+    else:
+        algorithm = "random" if all(part.source == "uniform" for part in parts) else "SAC (Stable-Baselines3)"
     return {
         "dataset_id": dataset_id,
         "minari_version": made["minari"],
         "eval_env_spec": without_margin(recording.spec)[0],
-        "algorithm_name": recording.given.algorithm
-        if recording.given
-        else "random"
-        if all(p.source == "uniform" for p in parts)
-        else "SAC (Stable-Baselines3)",
+        "algorithm_name": algorithm,
         "author": {"offbench"},
         "author_email": {"offbench@example.org"},
         "code_permalink": f"{HOME}/tree/v{made['offbench']}",

@@ -15,7 +15,7 @@ import math
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -37,8 +37,7 @@ from offbench.rollouts.policy import Policy, from_bytes
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
-LANES = 16  # episodes that share a policy forward
-TASK = 16  # episodes of a task
+LANES = 16  # episodes that share a policy forward, and of a task
 LAST_TASK = 4  # near the end of a recording, where large tasks would leave workers idle
 NOISE_BLOCK = 1024  # actions whose noise is drawn at once
 
@@ -311,7 +310,7 @@ class Rollouts:
 
     def episodes(
         self, policy: Policy | FunctionPolicy, seed: int, stream: tuple[int, ...] = (), enough: int | None = None
-    ) -> Iterator[Episode]:
+    ) -> Generator[Episode, None, None]:
         """Yield episodes 0, 1, 2, ... of the sampling policy without end, in order. Close the iterator when done.
 
         Args:
@@ -324,8 +323,7 @@ class Rollouts:
         try:
             while True:
                 while len(pending) < ahead:
-                    # the first tasks are small, so that short recordings keep every worker busy
-                    size = LANES if begun < LANES * ahead else TASK
+                    size = LANES
                     if enough is not None and done:
                         wanted = (enough - steps) * done / steps - (begun - done)  # if all are as long as those so far
                         if wanted <= 0 and pending:
