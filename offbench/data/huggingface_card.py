@@ -86,10 +86,10 @@ def _content(summary: Summary) -> dict[str, str]:
         "episode length": f"mean {lengths.mean():.1f}, {lengths.min()} to {lengths.max()}",
         "return of an episode": f"mean {mean:.1f}, {spread}",
     }
-    low, high = meta.get("ref_min_score"), meta.get("ref_max_score")
-    if low is not None and high is not None and high > low:
+    if references := minari_store.references(meta):
+        low, high = references
         facts["reference returns"] = f"{low:.1f} (score 0), {high:.1f} (score 100)"
-        facts["normalized score of the data"] = f"{normalize(mean, float(low), float(high)):.1f}"
+        facts["normalized score of the data"] = f"{normalize(mean, low, high):.1f}"
     if meta.get("algorithm_name"):
         facts["behaviour policy"] = str(meta["algorithm_name"])
     return facts

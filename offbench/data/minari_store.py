@@ -205,6 +205,12 @@ def provenance(metadata: JsonObject) -> Provenance:
     return read_back(Provenance, metadata.get(KEY) or {}, "the metadata", "record or download the dataset again")
 
 
+def references(metadata: JsonObject) -> tuple[float, float] | None:
+    """Return a dataset's own reference returns (random, expert); None if it has none to normalize by."""
+    low, high = metadata.get("ref_min_score"), metadata.get("ref_max_score")
+    return (float(low), float(high)) if low is not None and high is not None and high > low else None
+
+
 class ContentHash:
     """SHA-256 over the arrays of episodes in order: the same for the same data, whatever file holds them."""
 

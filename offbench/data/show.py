@@ -1,7 +1,8 @@
-"""`list` and `show`: what is here, and what is in a dataset."""
+"""`show`: what is in a dataset."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
 from offbench.common.scores import normalize
-from offbench.data import minari_store
+from offbench.data import minari_store, transitions
 
 BINS = 12
 BAR = 40
@@ -30,7 +31,6 @@ class Summary:
     def lines(self) -> list[str]:
         """Return spaces, episodes, a histogram of returns and the provenance as text."""
         ours, meta = minari_store.provenance(self.metadata), self.metadata
-        low, high = meta.get("ref_min_score"), meta.get("ref_max_score")
         lines = [
             f"{self.dataset_id}: {meta.get('description', 'no description')}",
             f"spaces          observations {space(meta, 'observation_space')}, actions {space(meta, 'action_space')}",
@@ -40,8 +40,9 @@ class Summary:
             f"return          mean {self.returns.mean():.1f}, std {self.returns.std():.1f}, "
             f"{self.returns.min():.1f} to {self.returns.max():.1f}",
         ]
-        if low is not None and high is not None and high > low:
-            score = normalize(float(self.returns.mean()), float(low), float(high))
+        if references := minari_store.references(meta):
+            low, high = references
+            score = normalize(float(self.returns.mean()), low, high)
             lines.append(f"references      random {low:.1f}, expert {high:.1f}: normalized mean return {score:.1f}")
         lines += ["", *_histogram(self.returns), ""]
         lines.append("provenance")
@@ -76,8 +77,6 @@ def show(dataset_id: str) -> Summary:
     Raises:
         OffbenchError: no such dataset, or it cannot be read.
     """
-    from offbench.data import transitions
-
     data = transitions.load(dataset_id)
     lengths = np.diff(data.ends, prepend=0)
     terminated = float((data.masks[data.ends - 1] == 0).mean())
@@ -95,8 +94,6 @@ def fact(value: object) -> str:
 
 def space(metadata: JsonObject, key: str) -> str:
     """Return a space of the metadata, e.g. `Box (11,) float64`."""
-    import json
-
     try:
         space = json.loads(metadata[key])
         return f"{space['type']} {tuple(space['shape'])} {space['dtype']}"

@@ -87,10 +87,7 @@ class Transitions:
         recorded = evaluation_spec(self.metadata)
         if self.evaluated_in and recorded and not same_environment(self.evaluated_in, recorded):
             return None
-        low, high = self.metadata.get("ref_min_score"), self.metadata.get("ref_max_score")
-        if low is None or high is None or not float(high) > float(low):
-            return None
-        return float(low), float(high)
+        return minari_store.references(self.metadata)
 
     def best(self, share: float) -> Array:
         """Return the indices of the transitions of the best `share` of all episodes by return, in order."""
