@@ -91,10 +91,6 @@ class Findings:
         assert code in FAULTS, code
         self._seen.setdefault(code, []).append((where, detail))
 
-    def codes(self) -> set[str]:
-        """Return the codes of the findings so far."""
-        return set(self._seen)
-
     def all(self) -> tuple[Finding, ...]:
         """Return the findings in the order of FAULTS."""
         return tuple(self._finding(code) for code in FAULTS if code in self._seen)

@@ -7,7 +7,6 @@ resimulate    a sample of episodes played again in the environment
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
@@ -23,7 +22,7 @@ from offbench.common.seeds import Purpose
 from offbench.common.text import counted
 from offbench.data import minari_store
 from offbench.data.file_stamps import unchanged
-from offbench.data.minari_reader import Recorded, episodes_of, reading
+from offbench.data.minari_reader import Recorded, episodes_of, open_minari, reading
 from offbench.data.recorded_env import margins_matter, recorded_margin, recorded_mujoco
 from offbench.envs.environments import box, same_bounds, untrusted_env
 from offbench.envs.margin_rule import ADDED, EARLIER, SINCE, with_margin
@@ -49,7 +48,7 @@ def verify(dataset_id: str, *, episodes: int | None = None, workers: int | None 
     Args:
         dataset_id: its id.
         episodes: how many are played again in the environment, where that is possible (default: 300).
-        workers: processes for it (default: one a core).
+        workers: processes for it (default: one per core).
 
     Returns:
         The report; `report.ok` is False if something is off. Damaged data are findings, not errors.
@@ -62,8 +61,6 @@ def verify(dataset_id: str, *, episodes: int | None = None, workers: int | None 
 
 
 def _verify(dataset_id: str, episodes: int | None, workers: int | None) -> Report:
-    from offbench.data.minari_reader import open_minari  # here, because `verify --help` need not wait for Minari
-
     report, findings = Report(dataset_id), Findings()
     if not minari_store.exists(dataset_id):
         minari_store.read_metadata(dataset_id)  # raises, and names the nearest id
@@ -73,26 +70,23 @@ def _verify(dataset_id: str, episodes: int | None, workers: int | None) -> Repor
         metadata = minari_store.read_metadata(dataset_id)
         code = "unreadable"
         data = open_minari(dataset_id)
+        box(data.observation_space, f"{dataset_id}: observations")
+        box(data.action_space, f"{dataset_id}: actions")
+        limit = _limit(metadata.get("env_spec"))
+        with reading(dataset_id):
+            survey = scan(data, limit, findings)
     except DamagedError as error:
         findings.add(code, dataset_id, str(error))
-        return dataclasses.replace(report, findings=findings.all())
-    box(data.observation_space, f"{dataset_id}: observations")
-    box(data.action_space, f"{dataset_id}: actions")
-    spec = metadata.get("env_spec")
-    try:
-        with reading(dataset_id):
-            survey = scan(data, _limit(spec), findings)
-    except DamagedError as error:
-        findings.add("unreadable", dataset_id, str(error))
-        return dataclasses.replace(report, findings=findings.all())
+        report.findings = findings.all()
+        return report
     report.transitions, report.episodes = survey.steps, len(survey.lengths)
     report.checked.append("every episode: shapes, types, ends, finite numbers, bounds, duplicates, seeds")
     if not survey.steps:
         findings.add("empty", dataset_id)
     _counts(metadata, dataset_id, survey, findings)
-    _terminations(survey, _limit(spec), findings)
-    last = check_claims(minari_store.provenance(metadata), survey, _limit(spec), report, findings)
-    chosen = _choose(survey, _limit(spec), last, episodes)
+    _terminations(survey, limit, findings)
+    last = check_claims(minari_store.provenance(metadata), survey, limit, report, findings)
+    chosen = _choose(survey, limit, last, episodes)
     _play(data, chosen, survey, metadata, workers, report, findings)
     report.findings = findings.all()
     return report
@@ -136,8 +130,6 @@ def _play(
     spec = metadata.get("env_spec")
     if not spec:
         report.skipped.append("playing episodes again: the dataset names no environment")
-        return
-    if not survey.steps:
         return
     if not chosen or not _same_spaces(spec, data, report, findings):
         return
