@@ -156,11 +156,10 @@ def _write_d4rl(path: Path, parts: Iterator[Columns], about: str) -> None:
             disk.check()
             for name, array in rows.items():
                 if name not in file:
-                    options = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
-                    shape = (None, *array.shape[1:])
-                    chunks = (CHUNK, *array.shape[1:])
+                    row = array.shape[1:]
+                    extents = {"shape": (0, *row), "maxshape": (None, *row), "chunks": (CHUNK, *row)}
                     file.create_dataset(
-                        name, (0, *array.shape[1:]), array.dtype, maxshape=shape, chunks=chunks, **options
+                        name, dtype=array.dtype, **extents, compression="gzip", compression_opts=4, shuffle=True
                     )
                 column = file[name]
                 column.resize(len(column) + len(array), axis=0)

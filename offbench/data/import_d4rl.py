@@ -137,9 +137,10 @@ def _origin(source: Source, env: str | None) -> _Origin:
 def _by_name(source: Source, recipe: Recipe) -> _Origin:
     """Return the environment of a file that is named like D4RL's own ones."""
     spec, family = recipe.env_spec(), recipe.env_id.rpartition("-v")[0]
+    today = _shapes(spec)
     name = next((name for name in ORIGINAL if name.startswith(f"{family}-v")), None)
     if name is None:
-        recorded, shapes = spec, _shapes(spec)
+        recorded, shapes = spec, today
     else:
         code = f"gym.envs.mujoco:{family}Env"
         recorded, shapes = EnvSpec(name, code, max_episode_steps=D4RL_LIMIT).to_json(), ORIGINAL[name]
@@ -148,11 +149,11 @@ def _by_name(source: Source, recipe: Recipe) -> _Origin:
             f"{source.path.name} is named like a file of {name or recipe.env_id}, which has {_words(shapes)}, but has "
             f"{_words(source.shapes)}; give its environment, e.g. --env my-env.toml"
         )
-    if _shapes(spec) == source.shapes:
+    if today == source.shapes:
         return _Origin(recorded, spec, recipe)
     warn(
         f"{source.path.name} is of {name}, which has {_words(shapes)}, and {recipe.env_id} has "
-        f"{_words(_shapes(spec))}: policies are not evaluated"
+        f"{_words(today)}: policies are not evaluated"
     )
     return _Origin(recorded, None, recipe)
 
@@ -337,8 +338,8 @@ def _spaces(source: Source, recipe: Recipe | None) -> tuple[Space, Space]:
         if [space.shape for space in boxes] != [observations.shape[1:], actions.shape[1:]]:
             raise OffbenchError(f"{source.path}: its offbench metadata are of other shapes; export the dataset again")
         return boxes[0], boxes[1]
-    low = high = np.ones(actions.shape[1:], np.float32)
-    low = -low
+    high = np.ones(actions.shape[1:], np.float32)
+    low = -high
     if recipe is not None:
         _, space = spaces_of(make_env(recipe.env_spec()), recipe.env_id)
         if space.shape == actions.shape[1:]:

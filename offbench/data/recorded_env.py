@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 
@@ -51,19 +52,14 @@ def recorded_margin(metadata: JsonObject) -> str | None:
     recorded = "versions" in (metadata.get(minari_store.KEY) or {})  # by offbench, first with the earlier rule alone
     if ours.contact_margin or recorded:
         return ours.contact_margin or EARLIER
-    for operator, major, minor in _demands(metadata):
+    demands = (CLAUSE.findall(item) for item in _requirements(metadata) if re.match(r"\s*mujoco\b(?!-)", item))
+    for operator, major, minor in itertools.chain.from_iterable(demands):
         version = (int(major), int(minor or 0))
         if operator in ("==", "~=", ">=", ">") and version >= (3, 5):
             return ADDED
         if (operator in ("==", "<=") and version < (3, 5)) or (operator == "<" and version <= (3, 5)):
             return EARLIER
     return None
-
-
-def _demands(metadata: JsonObject) -> list[tuple[str, str, str]]:
-    """Return (operator, major, minor) of each demand that Minari's requirements make on MuJoCo's version."""
-    ours = (item for item in _requirements(metadata) if re.match(r"\s*mujoco\b(?!-)", item))
-    return [clause for item in ours for clause in CLAUSE.findall(item)]
 
 
 def _requirements(metadata: JsonObject) -> list[str]:

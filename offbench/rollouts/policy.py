@@ -104,10 +104,8 @@ class Policy:
         batch, size = np.atleast_2d(np.asarray(observation)), len(self.observation_mean)
         if batch.ndim != 2 or batch.shape[1] != size:
             raise OffbenchError(f"the policy takes observations ({size},), not {np.shape(observation)}")
-        noise = self.draw(rng or self._rng, len(batch)) if self.needs_noise(rng is None) else None
-        if self.kind == "uniform" and noise is None:
-            noise = self.draw(self._rng, len(batch))
-        actions = self.act(batch, noise)
+        noisy = self.kind == "uniform" or self.needs_noise(rng is None)
+        actions = self.act(batch, self.draw(rng or self._rng, len(batch)) if noisy else None)
         return actions if np.ndim(observation) == 2 else actions[0]
 
     @functools.cached_property
