@@ -87,7 +87,9 @@ def command_of(line: str) -> list[str]:
     return [sys.executable, "-m", program, *words] if program == "offbench" else [program, *words]
 
 
-def test_minaris_command_line_shows_and_combines(tiny: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_minaris_command_line_shows_lists_and_combines(
+    tiny: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
     from typer.testing import CliRunner
 
     names = [offbench.collect(tiny[0], level, behaviour_dir=tiny[1], workers=1) for level in ("medium", "expert")]
@@ -98,8 +100,11 @@ def test_minaris_command_line_shows_and_combines(tiny: tuple[str, str], capsys: 
 
         shown = CliRunner().invoke(app, ["show", names[0]])
         combined = CliRunner().invoke(app, ["combine", *names, "--dataset-id", "both-v0"])
+        listed = CliRunner().invoke(app, ["list", "local"])
         assert shown.exit_code == combined.exit_code == 0, combined.output
         assert "InvertedPendulum-v5" in shown.output
+        assert "tiny-medium" in shown.output
+        assert "tiny-medium" in listed.output
         both = minari.load_dataset("both-v0")
         few = both.filter_episodes(lambda episode: len(episode) > 20)
     assert both.total_steps == 1200

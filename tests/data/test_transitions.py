@@ -234,10 +234,3 @@ def test_bounds_far_beyond_the_actions_are_said(
     space = gym.spaces.Box(-bound, bound, (2,), np.float32)
     offbench.load(foreign("wide-v0", [episode(3, 0, True, actions=actions)], actions=space))
     assert ("correct the action space" in capsys.readouterr().err) == warned
-
-
-def test_bounds_that_are_none_are_refused() -> None:
-    most = np.finfo(np.float32).max
-    space = gym.spaces.Box(-most, most, (2,), np.float32)
-    with pytest.raises(OffbenchError, match="must be bounded"):
-        offbench.load(foreign("huge-v0", [episode(3, 0, True)], actions=space))

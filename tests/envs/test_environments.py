@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
-import offbench
 from offbench.common.errors import OffbenchError
 from offbench.data.minari_reader import Recorded
 from offbench.envs import environments
@@ -252,8 +251,3 @@ def test_a_variable_that_keeps_mujoco_from_loading_is_named(offbench_cli: Any) -
 
 def bad_renderer() -> dict[str, str]:
     return {**os.environ, "MUJOCO_GL": "nonsense"}
-
-
-def test_make_env_still_makes_what_is_sound() -> None:
-    assert make_env(env_spec("InvertedPendulum-v5")).action_space.shape == (1,)
-    assert offbench.make_env("inverted-pendulum").spec is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import gymnasium as gym
@@ -102,7 +103,7 @@ def _damage(kind: str, path: Path) -> None:
     if kind in ("nan", "missing", "shape", "float64"):
         with open(path, "rb") as file:
             length = int.from_bytes(file.read(8), "little")
-            header = __import__("json").loads(file.read(length))["__metadata__"]
+            header = json.loads(file.read(length))["__metadata__"]
         save_file({k: np.ascontiguousarray(v) for k, v in tensors.items()}, path, metadata=header)
     if kind == "no header":
         save_file(tensors, path)

@@ -122,7 +122,7 @@ def test_observations_shifted_by_one(hopper: str, shift: Callable[[h5py.Group], 
 
 
 def test_swapped_medium_and_expert() -> None:
-    """Under each other's id, everything else made to fit; and as the halves of medium-expert."""
+    """Under each other's id, everything else made to fit."""
     names = [offbench.collect("inverted-pendulum", level, steps=20_000, workers=1) for level in ("medium", "expert")]
     files = [minari_store.path_of(name) / "data" / "main_data.hdf5" for name in names]
     contents = [path.read_bytes() for path in files]
@@ -130,15 +130,15 @@ def test_swapped_medium_and_expert() -> None:
         path.write_bytes(content)
     for name in names:
         assert codes(tamper(name, lambda _: None)) >= {"wrong-level"}
-    both = offbench.collect("inverted-pendulum", "medium-expert", steps=40_000, workers=1)
-    parts = minari_store.provenance(minari_store.read_metadata(both)).parts
-    change_metadata(both, parts=parts[::-1])
-    assert codes(both) >= {"wrong-level", "metadata"}
 
 
 def test_swapped_halves_of_medium_expert() -> None:
-    """The episodes themselves change places, seeds and all; parts of equal size still end where episodes end."""
+    """In the metadata; then the episodes change places, seeds and all: equal parts still end where episodes end."""
     name = offbench.collect("inverted-pendulum", "medium-expert", steps=40_000, workers=1)
+    parts = minari_store.provenance(minari_store.read_metadata(name)).parts
+    change_metadata(name, parts=parts[::-1])
+    assert codes(name) >= {"wrong-level", "metadata"}
+    change_metadata(name, parts=parts)
     first = int(np.searchsorted(np.cumsum([len(e) for e in episodes_of(open_minari(name))]), 20_000)) + 1
 
     def swap(file: h5py.File) -> None:
@@ -191,11 +191,10 @@ def test_terminations_marked_as_timeouts(medium: str) -> None:
     assert codes(tamper(medium, edit)) == {"terminations-as-timeouts"}
 
 
-@pytest.mark.parametrize("bound", [0.5, 0.9])
-def test_actions_clipped_after_the_fact(hopper: str, bound: float) -> None:
+def test_actions_clipped_after_the_fact(hopper: str) -> None:
     def edit(file: h5py.File) -> None:
         for group in each(file):
-            group["actions"][:] = np.clip(group["actions"][()], -bound, bound)
+            group["actions"][:] = np.clip(group["actions"][()], -0.9, 0.9)
 
     assert codes(tamper(hopper, edit)) == {"clipped-actions"}
 
@@ -236,8 +235,7 @@ def test_repeated_seeds(medium: str) -> None:
     assert codes(medium) == {"wrong-seeds", "other-start", "repeated-seeds"}
 
 
-@pytest.mark.parametrize("column", ["observations", "actions", "rewards"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize(("column", "value"), [("observations", np.nan), ("actions", np.inf), ("rewards", np.nan)])
 def test_numbers_that_are_none(medium: str, column: str, value: float) -> None:
     def edit(file: h5py.File) -> None:
         file["episode_1"][column][0] = value

@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
@@ -18,11 +17,6 @@ from offbench.envs.environments import env_spec, make_env
 from offbench.rollouts.rollouts import Episode
 from offbench.verification.verify import verify
 from tests.verification.test_verify import change_metadata, codes, each, hopper, metadata_path, replace, tamper
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
-    import minari
-    from minari.data_collector import EpisodeBuffer
 
 __all__ = ["hopper"]  # a fixture
 
@@ -104,31 +98,6 @@ def test_another_version_is_compared_within_a_tolerance_and_said(hopper: str) ->
             group["observations"][:] = group["observations"][()] * 1.001
 
     assert codes(tamper(hopper, edit)) == {"other-physics"}
-
-
-def test_a_foreign_recording_with_seeds_is_played_again() -> None:
-    """Written by Minari's own function, with no provenance of ours."""
-    env = gym.make("InvertedPendulum-v5")
-    env.action_space.seed(0)
-    buffers = []
-    for seed in range(5):
-        buffer: dict[str, Any] = {"observations": [env.reset(seed=seed)[0].copy()]}
-        buffer |= {key: [] for key in ("actions", "rewards", "terminations", "truncations")}
-        while not any(buffer["terminations"] + buffer["truncations"]):
-            action = env.action_space.sample()
-            observation, *rest, _ = env.step(action)
-            for key, value in zip(buffer, (observation.copy(), action, *rest), strict=True):
-                buffer[key].append(value)
-        arrays = {key: np.array(value) for key, value in buffer.items()}
-        buffers.append(EpisodeBuffer(seed=seed, infos={}, **arrays))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        minari.create_dataset_from_buffers(
-            "theirs-v0", buffers, env=env, data_format="hdf5", requirements=[f"mujoco=={versions()['mujoco']}"]
-        )
-    report = verify("theirs-v0", workers=1)
-    assert report.ok, report.lines()
-    assert any("5 episodes played again from their seeds, bit for bit" in line for line in report.checked)
 
 
 def saturated(name: str, env_id: str, change: Callable[[Any], None], seeded: bool) -> str:
