@@ -33,7 +33,7 @@ from offbench.common.terminal import inform
 from offbench.envs.environments import make_env, spaces_of
 from offbench.envs.recipes import Recipe
 from offbench.rollouts.policy import Policy, load_policy, uniform
-from offbench.rollouts.rollouts import MEASURES, Outcome, Rollouts, result, summary
+from offbench.rollouts.rollouts import MEASURES, Outcome, Rollouts, gathered, summary
 
 CANDIDATES = 8  # late rungs that are measured to choose the expert
 LOOKS = 6  # rungs that are measured to find the one nearest a return
@@ -112,7 +112,7 @@ class RungEvaluator:
 
     def run(self, policy: Policy, stream: tuple[int, ...], count: int, deterministic: bool = False) -> list[Outcome]:
         """Play evaluation episodes."""
-        return result(self.rollouts.outcomes(policy, self.folder.seed, stream, count, deterministic))
+        return gathered(self.rollouts.outcomes(policy, self.folder.seed, stream, count, deterministic))
 
     def estimate(self, step: int) -> float:
         """Return the return of a policy, as measured, or as screened if it was not measured."""
@@ -271,7 +271,7 @@ def random_reference(recipe: Recipe, seed: int, rollouts: Rollouts) -> dict[str,
     observations, actions = spaces_of(make_env(recipe.env_spec()), recipe.env_id)
     policy = uniform(actions.low, actions.high, observations.shape[0], recipe.env_id)
     episodes = recipe.measure.reference_episodes
-    outcomes = result(rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 0), episodes, False))
+    outcomes = gathered(rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 0), episodes, False))
     return summary(outcomes) | {"episodes": episodes}
 
 

@@ -52,7 +52,7 @@ from offbench.common.seeds import Purpose
 from offbench.envs.environments import Env, make_env
 from offbench.envs.recipes import Recipe, SACSettings
 from offbench.rollouts.policy import Policy
-from offbench.rollouts.rollouts import MEASURES, Named, Rollouts, summary
+from offbench.rollouts.rollouts import MEASURES, Named, Rollouts, gathered, summary
 
 SCREENED = ("step", "hours", *(f"{how}_{m}" for how in ("stochastic", "deterministic") for m in MEASURES), "episodes")
 POLICIES = 100  # of a segment at most, its rung included,
@@ -284,7 +284,7 @@ def _screen(folder: TrainingFolder, rollouts: Rollouts, policy: Policy, step: in
     row: dict[str, float] = {"episodes": episodes}
     for how, deterministic in (("stochastic", False), ("deterministic", True)):
         stream = (int(Purpose.RUNG), step, int(deterministic))
-        outcomes = rollouts.outcomes(policy, folder.seed, stream, episodes, deterministic).result()
+        outcomes = gathered(rollouts.outcomes(policy, folder.seed, stream, episodes, deterministic))
         row |= summary(outcomes, f"{how}_")
     return row
 

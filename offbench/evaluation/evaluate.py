@@ -20,7 +20,7 @@ from offbench.envs.margin_rule import ADDED, SINCE, without_margin
 from offbench.envs.recipes import d4rl_reference, load_recipe
 from offbench.envs.trust import REMEDY, is_trusting
 from offbench.rollouts.policy import Policy, load_policy
-from offbench.rollouts.rollouts import Rollouts, result
+from offbench.rollouts.rollouts import Rollouts, gathered
 from offbench.training.run import Run, RunConfig
 
 
@@ -83,9 +83,8 @@ def evaluate(
         raise OffbenchError(f"{path} is a deterministic policy; leave out --stochastic")
     workers = default_workers(workers)
     with Rollouts(spec, workers if workers > 1 else 0) as rollouts:
-        future = rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 2), episodes, not stochastic)
-        results = result(future)
-    returns = [episode.ret for episode in results]
+        outcomes = gathered(rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 2), episodes, not stochastic))
+    returns = [episode.ret for episode in outcomes]
     env_id = json.loads(spec)["id"]
     # a run's own references are of its own environment
     if config is not None and same_environment(config.env_spec, spec):
@@ -94,7 +93,7 @@ def evaluate(
         references = {"dataset": shipped_references(spec), "d4rl": d4rl_reference(spec)}
     scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in references.items() if pair}
     physics = f" with contact margins as in MuJoCo {SINCE[ADDED]}" if without_margin(spec)[1] == ADDED else ""
-    return Evaluation(str(path), env_id, returns, [episode.length for episode in results], scores, physics)
+    return Evaluation(str(path), env_id, returns, [episode.length for episode in outcomes], scores, physics)
 
 
 def _registered(env_id: str, path: Path) -> str:

@@ -14,8 +14,7 @@ import functools
 import math
 import multiprocessing
 import os
-import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -341,14 +340,14 @@ class Rollouts:
 
     def outcomes(
         self, policy: Policy | FunctionPolicy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
-    ) -> Future[list[Outcome]]:
-        """Start `count` evaluation episodes; the future gives their returns and lengths in order."""
+    ) -> list[Future[list[Outcome]]]:
+        """Start `count` evaluation episodes; `gathered` waits for their returns and lengths, in order."""
         data, parts = policy.to_bytes(), max(1, min(self.workers, count // 2))  # a task per worker, if they suffice
         tasks = (
             Task(self.spec, data, seed, stream, tuple(chunk.tolist()), deterministic)
             for chunk in np.array_split(np.arange(count), parts)
         )
-        return _gather([self.call(play_outcomes, task) for task in tasks])
+        return [self.call(play_outcomes, task) for task in tasks]
 
 
 def result(future: Future[T]) -> T:
@@ -359,30 +358,12 @@ def result(future: Future[T]) -> T:
         raise _worker_died() from None
 
 
+def gathered(futures: Iterable[Future[list[T]]]) -> list[T]:
+    """Return the results of several tasks, end to end."""
+    return [item for future in futures for item in result(future)]
+
+
 def _worker_died() -> OffbenchError:
     return OffbenchError(
         "a worker process died (killed, or out of memory); run the same command again, with fewer --workers"
     )
-
-
-def _gather(futures: Sequence[Future[list[Outcome]]]) -> Future[list[Outcome]]:
-    """Return one future for the results of several, end to end."""
-    whole: Future[list[Outcome]] = Future()
-    left = [len(futures)]
-    lock = threading.Lock()
-
-    def arrived(future: Future[list[Outcome]]) -> None:
-        with lock:
-            left[0] -= 1
-            if whole.done():
-                return
-            if future.cancelled():
-                whole.cancel()
-            elif future.exception() is not None:
-                whole.set_exception(future.exception())
-            elif left[0] == 0:
-                whole.set_result([outcome for f in futures for outcome in f.result()])
-
-    for future in futures:
-        future.add_done_callback(arrived)
-    return whole

@@ -23,7 +23,7 @@ from offbench.common.scores import normalize
 from offbench.common.seeds import Purpose
 from offbench.common.terminal import inform
 from offbench.data.transitions import Transitions
-from offbench.rollouts.rollouts import Outcome, Rollouts, result
+from offbench.rollouts.rollouts import Outcome, Rollouts, gathered
 from offbench.training.loggers import Loggers
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run
@@ -54,7 +54,7 @@ class Trainer:
         self.loggers = Loggers(self.runs, job.show)
         self.evaluations: list[dict[int, list[tuple[float, int]]]] = [{} for _ in self.runs]
         self.losses: list[list[dict[str, float]]] = [[] for _ in self.runs]
-        self.pending: list[tuple[int, int, Future[list[Outcome]]]] = []  # (run, step, episodes) under way
+        self.pending: list[tuple[int, int, list[Future[list[Outcome]]]]] = []  # (run, step, episodes) under way
         self.rollouts: Rollouts | None = None
         self.note = ""
         self.diverged: dict[int, str] = {}  # runs that have diverged, and what to tell the user
@@ -110,7 +110,7 @@ class Trainer:
             if step % LOG_EVERY == 0 or step == stop:
                 for rows, row in zip(self.losses, self.stack.logged(), strict=True):
                     rows.append({"step": step, **row})
-            if self.pending and all(future.done() for _, _, future in self.pending):
+            if self.pending and all(future.done() for *_, futures in self.pending for future in futures):
                 self._collect()
             report(step, self.note)
             if late or self.stops:
@@ -209,8 +209,8 @@ class Trainer:
 
     def _collect(self) -> None:
         """Wait for all evaluations under way and write them to the runs' files."""
-        for i, step, future in self.pending:
-            self.evaluations[i][step] = [(episode.ret, episode.length) for episode in result(future)]
+        for i, step, futures in self.pending:
+            self.evaluations[i][step] = [(episode.ret, episode.length) for episode in gathered(futures)]
             self.runs[i].write_evaluations(self.evaluations[i])
         if self.pending:
             self.note = self._score_note(self.pending[0][1])

@@ -199,13 +199,13 @@ def test_a_build_that_was_interrupted_measures_nothing_again(tiny: tuple[str, st
 
         calls = 0
 
-        def outcomes(self, *_: Any) -> Future[list[Outcome]]:
+        def outcomes(self, *_: Any) -> list[Future[list[Outcome]]]:
             self.calls += 1
             if self.calls > 2:
                 raise PlayedError
             future: Future[list[Outcome]] = Future()
             future.set_result([Outcome(30.0 + i, 9) for i in range(8)])
-            return future
+            return [future]
 
     def evaluator_of(folder: TrainingFolder) -> RungEvaluator:
         return RungEvaluator(folder, rows, folder.policy_steps(), Counting())  # type: ignore[arg-type]

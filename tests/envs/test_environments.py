@@ -19,7 +19,7 @@ from offbench.envs import environments
 from offbench.envs.environments import action_box, box, checked_spec, env_spec, make_env, untrusted_env
 from offbench.envs.recipes import d4rl_reference
 from offbench.rollouts.policy import uniform
-from offbench.rollouts.rollouts import Named, Rollouts, number
+from offbench.rollouts.rollouts import Named, Rollouts, gathered, number
 from offbench.verification.resimulate import check
 
 PENDULUM = (np.full(1, -3, np.float32), np.full(1, 3, np.float32))
@@ -62,7 +62,7 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> str:
 def play(spec: str) -> list[float]:
     policy = uniform(np.full(1, -1, np.float32), np.full(1, 1, np.float32), 3, "Steps-v0")
     with Rollouts(spec) as rollouts:
-        return [outcome.ret for outcome in rollouts.outcomes(policy, 0, (), 2, False).result()]
+        return [outcome.ret for outcome in gathered(rollouts.outcomes(policy, 0, (), 2, False))]
 
 
 @pytest.mark.parametrize(

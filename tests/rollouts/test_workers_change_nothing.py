@@ -28,7 +28,7 @@ from offbench.data import minari_store
 from offbench.data.collect import cut_at
 from offbench.envs.environments import env_spec, make_env
 from offbench.rollouts.policy import uniform
-from offbench.rollouts.rollouts import LANES, Episode, Rollouts, Task, play, result
+from offbench.rollouts.rollouts import LANES, Episode, Rollouts, Task, gathered, play
 
 SUMS_MARGINS = tuple(map(int, mujoco.__version__.split(".")[:2])) >= (3, 5)
 POLE = env_spec("InvertedPendulum-v5")
@@ -166,24 +166,24 @@ def test_sigterm_to_all_processes_leaves_evaluations_to_the_parent() -> None:
     """Slurm sends it so; the parent saves a checkpoint, and that waits for the evaluations under way."""
     policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     with Rollouts(POLE, workers=2) as rollouts:
-        result(rollouts.outcomes(policy, 0, (), 1, True))
-        future = rollouts.outcomes(policy, 0, (), 400, False)
+        gathered(rollouts.outcomes(policy, 0, (), 1, True))
+        futures = rollouts.outcomes(policy, 0, (), 400, False)
         assert rollouts._pool is not None
         for pid in rollouts._pool._processes:
             os.kill(pid, signal.SIGTERM)
-        assert len(result(future)) == 400
+        assert len(gathered(futures)) == 400
 
 
 def test_a_killed_worker_ends_those_beside_it() -> None:
     policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     with Rollouts(POLE, workers=2) as rollouts:
-        result(rollouts.outcomes(policy, 0, (), 100, False))
+        gathered(rollouts.outcomes(policy, 0, (), 100, False))
         assert rollouts._pool is not None
         first, *beside = rollouts._pool._processes
-        future = rollouts.outcomes(policy, 0, (), 4000, False)
+        futures = rollouts.outcomes(policy, 0, (), 4000, False)
         os.kill(first, signal.SIGKILL)
         with pytest.raises(OffbenchError, match="a worker process died"):
-            result(future)
+            gathered(futures)
         began = time.monotonic()
     assert beside
     assert time.monotonic() - began < 30
@@ -192,7 +192,7 @@ def test_a_killed_worker_ends_those_beside_it() -> None:
 def test_leaving_the_pool_ends_what_is_being_played() -> None:
     policy = uniform(*BOUNDS, 11, "Hopper-v5")
     with Rollouts(env_spec("Hopper-v5"), workers=1) as rollouts:
-        assert len(result(rollouts.outcomes(policy, 0, (), 1, False))) == 1
+        assert len(gathered(rollouts.outcomes(policy, 0, (), 1, False))) == 1
         many = Task(rollouts.spec, policy.to_bytes(), 0, (), tuple(range(10**6)), False)
         future = rollouts.call(play, many)
         while not future.running():
