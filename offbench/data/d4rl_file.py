@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
-from gymnasium.envs.registration import EnvSpec
 from minari.serialization import deserialize_space
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
 from offbench.data import minari_store
-from offbench.envs.margin_rule import without_margin
+from offbench.envs.environments import parse_spec
 
 COLUMNS = ("observations", "actions", "rewards", "terminals")
 SEEDS = ("infos/seed", "infos/seeded")  # seeded: where some episodes have a seed of 2**63 or more, and some none
@@ -110,7 +109,7 @@ def _about(path: Path, file: h5py.File) -> JsonObject:
             raise ValueError("a value of another type")
         for key in ("env_spec", "eval_env_spec"):
             if key in fields:
-                EnvSpec.from_json(without_margin(fields[key])[0])
+                parse_spec(fields[key])
         kept = tuple(deserialize_space(fields[key]) for key in ("observation_space", "action_space") if key in fields)
     except Exception as error:  # Gymnasium and Minari raise anything for JSON that is not theirs
         raise OffbenchError(f"{path}: its offbench metadata are damaged ({error}); export the dataset again") from None

@@ -33,7 +33,7 @@ from offbench.common.terminal import inform, warn
 from offbench.data import minari_store
 from offbench.data.d4rl_file import NUMBERS, SEEDS, Source, read_source
 from offbench.data.minari_reader import flags
-from offbench.envs.environments import Space, box, make_env, spaces_of, time_limit
+from offbench.envs.environments import Space, box, make_env, parse_spec, spaces_of, time_limit
 from offbench.envs.margin_rule import ADDED, MARGIN, without_margin
 from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference, load_recipe, names
 from offbench.rollouts.rollouts import Episode
@@ -106,7 +106,7 @@ class _Origin:
     @property
     def limit(self) -> int | None:
         """The time limit of the environment it was recorded in."""
-        return time_limit(EnvSpec.from_json(without_margin(self.recorded)[0])) if self.recorded else None
+        return time_limit(parse_spec(self.recorded)) if self.recorded else None
 
 
 def _origin(source: Source, env: str | None) -> _Origin:

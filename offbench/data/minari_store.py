@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from filelock import FileLock, Timeout
-from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
@@ -23,8 +22,8 @@ from offbench.common.files import JsonObject, damage, disk_errors, exclusive_loc
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.settings import read_back, setting
 from offbench.data.levels import parse_level
-from offbench.envs.environments import Space
-from offbench.envs.margin_rule import ADDED, EARLIER, without_margin
+from offbench.envs.environments import Space, parse_spec
+from offbench.envs.margin_rule import ADDED, EARLIER
 from offbench.envs.recipes import load_recipe, names
 from offbench.rollouts.rollouts import Episode
 
@@ -305,7 +304,7 @@ def write(
         spaces: of observations and actions, where the environment is not to be asked (it may be no longer there).
         expected: the content hash that the data must have (None: any).
     """
-    env_spec = EnvSpec.from_json(without_margin(spec)[0]) if spec else None
+    env_spec = parse_spec(spec) if spec else None
     aside = _beside(path, "partial")
     with disk_errors(str(path)):
         (aside / "data").mkdir(parents=True)

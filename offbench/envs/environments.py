@@ -60,6 +60,11 @@ def env_spec(env_id: str, **kwargs: Any) -> str:
     return text
 
 
+def parse_spec(text: str) -> EnvSpec:
+    """Return Gymnasium's EnvSpec of JSON text, which may have the field for contact margins."""
+    return EnvSpec.from_json(without_margin(text)[0])
+
+
 def checked_spec(text: str, where: str, observation_dim: int, low: Array, high: Array) -> str:
     """Return the EnvSpec JSON that a file carries if it can be trusted, made, and has the file's shapes.
 
@@ -70,7 +75,7 @@ def checked_spec(text: str, where: str, observation_dim: int, low: Array, high: 
         OffbenchError: it names code that is no Gymnasium environment, cannot be made, or has other shapes.
     """
     with contextlib.suppress(Exception):  # untrusted_env reports what is wrong with it
-        spec = EnvSpec.from_json(without_margin(text)[0])
+        spec = parse_spec(text)
         _warn_endless(spec.id, spec)
     try:
         env = untrusted_env(text, where)
@@ -110,7 +115,7 @@ def untrusted_env(text: str, where: str) -> Env:
         OffbenchError: it names code that is no Gymnasium environment, or cannot be made.
     """
     try:
-        spec = EnvSpec.from_json(without_margin(text)[0])
+        spec = parse_spec(text)
         _check_importable(spec)
         for wrapper in spec.additional_wrappers:
             if wrapper.kwargs is None:
