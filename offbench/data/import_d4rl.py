@@ -54,7 +54,7 @@ def import_d4rl(file: str | Path, dataset_id: str, *, env: str | None = None, ov
         dataset_id: the Minari id.
         env: the recipe of the environment that the file was recorded in, and that policies are evaluated in. By
             default it follows from a name such as `hopper_medium-v2.hdf5`, as D4RL's own files have it: recorded in
-            Hopper-v2, evaluated in the shipped recipe. A file of `offbench export` says itself.
+            Hopper-v2, evaluated in the shipped recipe. A file that `offbench export` wrote names it itself.
         overwrite: replace a dataset of that id.
 
     Returns:
@@ -237,7 +237,7 @@ def _starts(source: Source, origin: _Origin) -> Array:
     if origin.evaluated is None:
         warn(
             f"{source.path} has no timeouts, and without its environment an episode that begins "
-            "before the time limit of the last one cannot be told: each is one false transition"
+            "before the time limit of the last one cannot be detected: each leaves one false transition"
         )
         return starts
     env = make_env(origin.evaluated)

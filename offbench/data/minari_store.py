@@ -291,17 +291,17 @@ def write(
     spec: str | None,
     metadata: JsonObject,
     steps: int,
-    spaces: tuple[Space, Space] | None = None,
+    spaces: tuple[Space, Space],
     expected: str | None = None,
 ) -> str:
     """Write episodes as a Minari HDF5 dataset at `path`, whole or not at all; return the content hash.
 
     Args:
         path: the folder of a claimed id; what is there is replaced at the last moment.
-        spec: the environment's EnvSpec as JSON, None if unknown (`spaces` are needed then).
+        spec: the environment's EnvSpec as JSON, None if unknown.
         metadata: Minari's fields; the content hash joins those under the key `offbench`.
         steps: transitions to come, to see beforehand whether the disk has room.
-        spaces: of observations and actions, where the environment is not to be asked (it may be no longer there).
+        spaces: of observations and actions; Minari would otherwise make the environment, which may no longer exist.
         expected: the content hash that the data must have (None: any).
     """
     env_spec = parse_spec(spec) if spec else None
@@ -311,7 +311,7 @@ def write(
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                storage = MinariStorage.new(aside / "data", *(spaces or (None, None)), env_spec, "hdf5")
+                storage = MinariStorage.new(aside / "data", *spaces, env_spec, "hdf5")
             _check_room(aside, storage, steps)
             content, dtype = ContentHash(), storage.observation_space.dtype
             with safe_file(storage._file_path) as storage._file_path:  # so that a full disk is no crash

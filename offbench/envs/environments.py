@@ -30,7 +30,7 @@ from offbench.envs.trust import check_code
 Env: TypeAlias = gym.Env[Array, Array]
 Space: TypeAlias = gym.Space[Any]
 IDENTITY = ("id", "kwargs", "max_episode_steps")  # specs that agree in these and in the contact margins are the same
-LARGEST_BOUND = 1e6  # of actions; what has larger ones, such as float32's largest number, has none
+LARGEST_BOUND = 1e6  # of actions; larger ones, such as float32's largest number, count as none
 LONGEST = 20_000  # steps that an episode may take in an environment without a time limit
 LARGEST_LIMIT = 1_000_000  # a time limit beyond this is none
 OTHER_ENV = "give the right environment with --env RECIPE"

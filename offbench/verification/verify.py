@@ -1,6 +1,6 @@
 """`verify`: is a dataset what it says? Its episodes, its metadata against them, and a sample of them played again.
 
-survey        one pass over every episode: shapes, ends, numbers, bounds, twins, seeds, content hash
+scan          one pass over every episode: shapes, ends, numbers, bounds, duplicates, seeds, content hash
 metadata      parts, levels and their returns, as offbench recorded them
 resimulate    a sample of episodes played again in the environment
 """
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from minari import MinariDataset
 
 EPISODES = 300  # played again by default: half a minute for a million transitions
-SOME = 10  # of them tell the rule for contact margins, about
+SOME = 10  # of them, about, that are played under both rules for contact margins if the metadata name none
 REQUIREMENT = {EARLIER: "mujoco<3.5", ADDED: "mujoco>=3.5"}
 SEVERAL = 3  # terminations at the time limit, and none elsewhere, are no coincidence
 FEW = 20_000  # steps to play again that are not worth worker processes

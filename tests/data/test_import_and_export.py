@@ -20,6 +20,8 @@ from offbench.data.export import export
 from offbench.data.import_d4rl import import_d4rl
 from offbench.data.minari_reader import episodes_of, open_minari
 from offbench.verification.verify import verify
+from tests.cli.test_bad_input import refusal
+from tests.data.test_transitions import episode, foreign
 
 Columns = dict[str, npt.NDArray[Any]]
 KEYS = ("observations", "actions", "rewards", "next_observations", "terminals")
@@ -310,8 +312,6 @@ SPOILED = {
 def test_spoiled_files_are_one_clear_line(
     kind: str, home: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from tests.cli.test_bad_input import refusal
-
     path = home / "hopper_medium-v2.hdf5"
     d4rl_file(path, [(30, "terminal"), (20, "timeout")], 2, rng)
     spoil(path, kind)
@@ -327,8 +327,6 @@ def test_an_exported_file_that_was_changed_is_refused(
     medium: str, home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It carries the content hash of the dataset."""
-    from tests.cli.test_bad_input import refusal
-
     export(medium, home / "out.hdf5")
     with h5py.File(home / "out.hdf5", "a") as file:
         file["rewards"][7] += 1e-9
@@ -355,8 +353,6 @@ def test_metadata_in_a_file_run_no_code(medium: str, home: Path) -> None:
 
 
 def test_spaces_of_another_kind_are_refused() -> None:
-    from tests.data.test_transitions import episode, foreign
-
     discrete = {"actions": np.zeros(3, np.int64)}
     foreign("discrete-v0", [episode(3, 0, True, **discrete)], actions=gym.spaces.Discrete(2))
     with pytest.raises(OffbenchError, match="must be a Box space"):

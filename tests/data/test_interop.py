@@ -110,9 +110,7 @@ def test_minaris_command_line_shows_lists_and_combines(
     assert both.total_steps == 1200
     assert 0 < few.total_episodes < both.total_episodes
     assert len(offbench.load("both-v0")) == 1200
-    from offbench.verification.verify import verify
-
-    report = verify("both-v0", workers=1)
+    report = offbench.verify("both-v0", workers=1)
     assert report.ok, report.lines()
     assert any("one step at a time" in line for line in report.checked)
 
@@ -120,6 +118,13 @@ def test_minaris_command_line_shows_lists_and_combines(
 # PyTorch would rather see torch.export, see offbench/evaluation/export_policy.py
 old_format = pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")
 OBSERVATIONS = np.random.default_rng(0).normal(scale=3, size=(500, 11))
+
+
+def hopper_expert() -> Path:
+    """The file of the shipped expert."""
+    ladder = read_ladder(shipped() / "hopper" / "behaviour")
+    assert ladder is not None
+    return ladder.folder / "policies" / ladder.role("expert").policy
 
 
 def onnx_actions(path: Path, observations: Any) -> Any:
@@ -132,9 +137,7 @@ def onnx_actions(path: Path, observations: Any) -> Any:
 @pytest.mark.parametrize("kind", ["td3_bc", "bc", "the shipped expert"])
 def test_a_policy_as_torchscript_acts_the_same(kind: str, medium: str, home: Path) -> None:
     if kind == "the shipped expert":
-        ladder = read_ladder(shipped() / "hopper" / "behaviour")
-        assert ladder is not None
-        source = ladder.folder / "policies" / ladder.role("expert").policy
+        source = hopper_expert()
         policy = load_policy(source)
     else:
         settings: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 50, "eval_episodes": 1}
@@ -194,9 +197,7 @@ def test_policies_that_act_by_chance_are_refused(home: Path) -> None:
 
 
 def test_onnx_export_names_the_package_it_needs(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ladder = read_ladder(shipped() / "hopper" / "behaviour")
-    assert ladder is not None
     monkeypatch.setitem(sys.modules, "onnx", None)  # importing it fails
     with pytest.raises(OffbenchError, match=r"pip install 'offbench\[onnx\]'"):
-        export_policy(ladder.folder / "policies" / ladder.role("expert").policy, home / "policy.onnx")
+        export_policy(hopper_expert(), home / "policy.onnx")
     assert not (home / "policy.onnx").exists()

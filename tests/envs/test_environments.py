@@ -243,11 +243,8 @@ def test_a_limit_that_no_run_reaches_is_none() -> None:
 
 def test_a_variable_that_keeps_mujoco_from_loading_is_named(offbench_cli: Any) -> None:
     """A renderer that does not exist: nothing is drawn here, but MuJoCo reads the variable when it loads."""
-    done = offbench_cli("collect", "inverted-pendulum", "--level", "random", "--steps", "50", env=bad_renderer())
+    env = {**os.environ, "MUJOCO_GL": "nonsense"}
+    done = offbench_cli("collect", "inverted-pendulum", "--level", "random", "--steps", "50", env=env)
     assert done.returncode == 2
     assert "MUJOCO_GL=nonsense" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
-
-
-def bad_renderer() -> dict[str, str]:
-    return {**os.environ, "MUJOCO_GL": "nonsense"}

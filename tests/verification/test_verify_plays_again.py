@@ -50,7 +50,7 @@ def recorded(
 
     metadata = {"dataset_id": name, "minari_version": versions()["minari"], "offbench": {"versions": versions()}}
     with minari_store.claimed(name, False) as path:
-        minari_store.write(path, episodes(), spec, metadata, 1000)
+        minari_store.write(path, episodes(), spec, metadata, 1000, (env.observation_space, env.action_space))
     return name
 
 
