@@ -14,6 +14,7 @@ the metadata, under `offbench`. infos/ are left out.
 
 from __future__ import annotations
 
+import bisect
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -255,15 +256,12 @@ def _starts(source: Source, origin: _Origin) -> Array:
 
 def _episodes(source: Source, ends: dict[int, tuple[bool, bool]], progress: Progress) -> Iterator[Episode]:
     """Yield the episodes, many rows read at once."""
-    complete, lasts, begin, i = "next_observations" in source.columns, list(ends), 0, 0
-    empty = True
+    complete = "next_observations" in source.columns
+    wanted = ("observations", "actions", "rewards", "next_observations", *SEEDS)
+    lasts, begin, i, empty = list(ends), 0, 0, True
     while i < len(lasts):
-        group = [lasts[i]]
-        while i + len(group) < len(lasts) and lasts[i + len(group)] - begin < BLOCK:
-            group.append(lasts[i + len(group)])
-        wanted = ("observations", "actions", "rewards", "next_observations", *SEEDS)
-        names_ = [name for name in wanted if name in source.columns]
-        rows = {name: source.read(name, begin, group[-1] + 1) for name in names_}
+        group = lasts[i : max(i + 1, bisect.bisect_left(lasts, begin + BLOCK))]  # the episodes within a block
+        rows = {name: source.read(name, begin, group[-1] + 1) for name in wanted if name in source.columns}
         offset = begin
         for last in group:
             part = {name: values[begin - offset : last + 1 - offset] for name, values in rows.items()}
