@@ -168,9 +168,7 @@ def _full_size(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...]) -
 class _Recording:
     """What all parts of one dataset share. Without a ladder, parts are of uniform actions only."""
 
-    def __init__(
-        self, recipe: Recipe, ladder: Ladder | None, seed: int, workers: int, given: str | None = None
-    ) -> None:
+    def __init__(self, recipe: Recipe, ladder: Ladder | None, seed: int, workers: int, given: str | None) -> None:
         self.recipe, self._ladder, self.seed = recipe, ladder, seed
         self.workers = workers if workers > 1 else 0  # a single one would be no faster than this process
         self.spec = recipe.env_spec()

@@ -108,7 +108,6 @@ def test_a_changed_dataset_is_converted_anew(tiny: tuple[str, str], medium: str)
 
 
 BAD = {
-    "nan": ([episode(3, 0, True, rewards=np.array([0.0, np.nan, 1.0]))], "rewards hold NaN"),
     "inf": ([episode(3, np.inf, True)], "observations hold NaN or infinite"),
     "no-next": ([episode(3, 0, True, observations=np.zeros((3, 2)))], r"shape \(3, 2\), expected \(4, 2\)"),
     "width": ([episode(3, 0, True, actions=np.zeros((3, 1), np.float32))], r"shape \(3, 1\), expected \(3, 2\)"),
