@@ -15,6 +15,7 @@ import collections
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -26,7 +27,7 @@ from torch.utils._pytree import tree_map_only
 
 Args: TypeAlias = tuple[Any, ...]
 Kwargs: TypeAlias = dict[str, Any]
-Call = tuple[Callable[..., object], Args, Kwargs]
+Call: TypeAlias = Callable[[], object]
 Variant = tuple[Callable[..., object], list[str]]  # a function that writes into given outputs, and their names
 Nested = object  # tensors and plain values in tuples, lists and dicts
 _UNREPEATABLE = {
@@ -61,8 +62,8 @@ class Recording:
 
     def replay(self) -> None:
         """Do the update once more. Call it within `torch.inference_mode()`."""
-        for function, arguments, named in self.calls:
-            function(*arguments, **named)
+        for call in self.calls:
+            call()
 
     def same_as(self, other: Recording) -> bool:
         """Return whether two records do the same with the same numbers."""
@@ -221,8 +222,8 @@ def _state(value: object, above: frozenset[int]) -> object:
 def _single(func: OpOverload, args: Args, kwargs: Kwargs) -> Call:
     """Return the call of an operation in place; that of a list of one tensor (Adam's step count) as the tensor's."""
     if func is torch.ops.aten._foreach_add_.Scalar and len(args[0]) == 1:
-        return args[0][0].add_, (args[1],), kwargs
-    return func, args, kwargs
+        return partial(args[0][0].add_, args[1], **kwargs)
+    return partial(func, *args, **kwargs)
 
 
 def _tensors(nested: Nested) -> list[Tensor]:
@@ -257,17 +258,15 @@ def _in_place(func: OpOverload, args: Args, kwargs: Kwargs, result: Tensor | Seq
     variant = _OUT[func] if whole else None
     if variant is not None:
         function, names = variant
-        if len(names) == 1 or function is not getattr(torch, func.overloadpacket.__name__, None):
-            return function, args, {**kwargs, **dict(zip(names, outputs, strict=True))}
-        return function, args, {**kwargs, "out": tuple(outputs)}
+        return partial(function, *args, **kwargs, **dict(zip(names, outputs, strict=True)))
 
-    def copy(*arguments: object, **named: object) -> None:
-        again = func(*arguments, **named)
+    def copy() -> None:
+        again = func(*args, **kwargs)
         for output, new in zip(outputs, [again] if isinstance(again, Tensor) else again, strict=True):
             if output is not None:
                 output.copy_(new)
 
-    return copy, args, kwargs
+    return copy
 
 
 def _variants(func: OpOverload, count: int) -> Iterator[Variant]:

@@ -23,6 +23,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,12 +31,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from offbench.algorithm.cpu_capture import one_call
+from offbench.algorithm.cpu_capture import Call, one_call
 from offbench.algorithm.stacked import layers_of, one_by_one, stacked
 
 _WAY = ContextVar("way", default="numpy")
 Array = npt.NDArray[np.float32]
-Call = tuple[Callable[..., object], tuple[object, ...]]  # a function and its arguments
 Buffer = TypeVar("Buffer", Array, Tensor)
 ALIGNED = 16  # float32 numbers of 64 bytes: rows of buffers begin where a processor's wide registers do
 NARROW = 64  # a product with fewer inputs or outputs gains nothing from bfloat16 on a CPU
@@ -94,7 +94,7 @@ class _Perceptrons(torch.autograd.Function):
             ctx.made = made = Pass(flat, inputs, sizes, activation, keep, half)
             made.run()
         if recording:
-            recording.add(("forward", sizes, activation, keep, half), (flat, inputs), made.outputs, (made.run, (), {}))
+            recording.add(("forward", sizes, activation, keep, half), (flat, inputs), made.outputs, made.run)
         ctx.save_for_backward(flat)  # autograd sees if it was changed since
         return made.outputs
 
@@ -108,7 +108,7 @@ class _Perceptrons(torch.autograd.Function):
         gradients = (back.of_flat, *back.of_inputs)
         if recording:
             reads, writes = (ctx.made.outputs, grads[0]), [gradient for gradient in gradients if gradient is not None]
-            recording.add(("backward", needs), reads, writes, (back.run, (), {}))
+            recording.add(("backward", needs), reads, writes, back.run)
         return gradients[0], None, None, None, *gradients[1:]
 
 
@@ -136,8 +136,8 @@ class Pass:
         self.outputs = torch.empty(*self.shape, sizes[-1])
         x = [_with_ones(batch, sizes[0]) for _ in range(runs)]
         starts = [0, *itertools.accumulate(self.widths)]
-        self._loads = [
-            (x[run][:, start:end], part[run])
+        self.calls: list[Call] = [
+            partial(np.copyto, x[run][:, start:end], part[run])
             for start, end, part in zip(starts, starts[1:], (_array(part) for part in inputs), strict=False)
             for run in range(runs)
         ]
@@ -145,33 +145,28 @@ class Pass:
         # what goes into each layer, [batch, in + 1], of each perceptron
         self.into: dict[tuple[int, int], list[Array]] = {}
         self.halves: dict[tuple[int, int, int], _Half] = {}  # the layers in bfloat16, of each perceptron
-        self._steps: list[tuple[*Call, Callable[[], object] | None]] = []
         outputs = _array(self.outputs)
         for member, run in itertools.product(range(ensemble), range(runs)):
             h, self.into[member, run] = x[run], [x[run]]
             for layer, width in enumerate(sizes[1:-1]):
                 make = _with_ones if keep else _shared(f"layer {layer}", _with_ones)
                 into = make(batch, width)
-                hidden = torch.from_numpy(into[:, :-1])
-                activate = hidden.relu_ if activation == "relu" else hidden.tanh_
                 weight = self.layers[layer][member, run]
                 if half and min(sizes[layer], width) >= NARROW:
                     product = self.halves[member, run, layer] = _Half(h, weight, into[:, :-1], keep)
-                    self._steps.append((product.forward, (), activate))
+                    self.calls.append(product.forward)
                 else:
-                    self._steps.append((np.matmul, (h, weight, into[:, :-1]), activate))
+                    self.calls.append(partial(np.matmul, h, weight, into[:, :-1]))
+                hidden = torch.from_numpy(into[:, :-1])
+                self.calls.append(hidden.relu_ if activation == "relu" else hidden.tanh_)
                 h = into
                 self.into[member, run].append(into)
-            self._steps.append((np.matmul, (h, self.layers[-1][member, run], outputs[member, run]), None))
+            self.calls.append(partial(np.matmul, h, self.layers[-1][member, run], outputs[member, run]))
 
     def run(self) -> None:
         """Compute `outputs`."""
-        for into, source in self._loads:
-            np.copyto(into, source)
-        for multiply, arguments, activate in self._steps:
-            multiply(*arguments)
-            if activate is not None:
-                activate()
+        for call in self.calls:
+            call()
 
 
 class PassBack:
@@ -194,31 +189,31 @@ class PassBack:
             torch.empty(runs, batch, width) if needed else None
             for width, needed in zip(widths, needs_inputs, strict=True)
         ]
-        self._calls: list[Call] = []
+        self.calls: list[Call] = []
         last = _array(grad)
         if not grad.is_contiguous():
             last = np.empty(grad.shape, np.float32)
-            self._calls.append((np.copyto, (last, _array(grad))))
+            self.calls.append(partial(np.copyto, last, _array(grad)))
         for member, run in itertools.product(range(ensemble), range(runs)):
             g = last[member, run]
             for layer in reversed(range(len(sizes) - 1)):
                 h, weight = forward.into[member, run][layer], forward.layers[layer][member, run][:-1]
                 half = forward.halves.get((member, run, layer))
                 if half is not None:
-                    self._calls.append((half.load, (torch.from_numpy(g),)))
+                    self.calls.append(partial(half.load, torch.from_numpy(g)))
                 if of_layers is not None:
                     of_layer = of_layers[layer][member, run]
                     if half is None:
-                        self._calls.append((np.matmul, (h.T, g, of_layer)))
+                        self.calls.append(partial(np.matmul, h.T, g, of_layer))
                     else:
-                        self._calls.append((half.of_weight, (torch.from_numpy(of_layer),)))
+                        self.calls.append(partial(half.of_weight, torch.from_numpy(of_layer)))
                 if layer:
                     before = _shared(f"gradient {layer % 2}", _rows)(batch, sizes[layer])
                     if half is None:
                         self._product(g, weight.T, before)
                     else:
-                        self._calls.append((half.of_h, (torch.from_numpy(before),)))
-                    self._calls.append(_through(forward.activation, before, h[:, :-1]))
+                        self.calls.append(partial(half.of_h, torch.from_numpy(before)))
+                    self.calls.append(_through(forward.activation, before, h[:, :-1]))
                     g = before
                     continue
                 start = 0
@@ -230,21 +225,20 @@ class PassBack:
                         else:
                             other = _shared("gradient of an input", _rows)(batch, width)
                             self._product(g, part, other)
-                            self._calls.append((np.add, (of_input, other, of_input)))
+                            self.calls.append(partial(np.add, of_input, other, of_input))
                     start += width
 
     def _product(self, a: Array, b: Array, out: Array) -> None:
         """Add the call of a @ b; NumPy is slow at outer products, those of a layer with one output."""
         if a.shape[1] == 1:
-            arguments = [torch.from_numpy(array) for array in (a, b, out)]
-            self._calls.append((_multiply, tuple(arguments)))
+            self.calls.append(partial(torch.mul, torch.from_numpy(a), torch.from_numpy(b), out=torch.from_numpy(out)))
         else:
-            self._calls.append((np.matmul, (a, b, out)))
+            self.calls.append(partial(np.matmul, a, b, out))
 
     def run(self) -> None:
         """Compute `of_flat` and `of_inputs`."""
-        for function, arguments in self._calls:
-            function(*arguments)
+        for call in self.calls:
+            call()
 
 
 class _Half:
@@ -294,21 +288,12 @@ def _halves(rows: int, columns: int) -> Tensor:
     return torch.empty(rows, columns, dtype=torch.bfloat16)
 
 
-def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
-    torch.mul(a, b, out=out)
-
-
 def _through(activation: str, gradient: Array, h: Array) -> Call:
     """Return the call that turns the gradient of an activation's output h into that of its input, in place."""
-    return (_through_relu if activation == "relu" else _through_tanh), tuple(map(torch.from_numpy, (gradient, h)))
-
-
-def _through_relu(gradient: Tensor, h: Tensor) -> None:
-    torch.ops.aten.threshold_backward.grad_input(gradient, h, 0, grad_input=gradient)
-
-
-def _through_tanh(gradient: Tensor, h: Tensor) -> None:
-    torch.ops.aten.tanh_backward.grad_input(gradient, h, grad_input=gradient)
+    g, output = torch.from_numpy(gradient), torch.from_numpy(h)
+    if activation == "relu":
+        return partial(torch.ops.aten.threshold_backward.grad_input, g, output, 0, grad_input=g)
+    return partial(torch.ops.aten.tanh_backward.grad_input, g, output, grad_input=g)
 
 
 def _array(tensor: Tensor) -> Array:

@@ -98,26 +98,18 @@ def update(algorithm: str, precision: str) -> dict[str, float]:
 
 def calls(recording: Recording) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield each call of a replay, those within the networks' passes one by one, with the part that it belongs to."""
-    for function, arguments, named in recording.calls:
-        owner = getattr(function, "__self__", None)
-        if isinstance(owner, mlp.Pass):
-            for into, source in owner._loads:
-                yield REST, partial(np.copyto, into, source)
-            for multiply, factors, activate in owner._steps:
-                yield PRODUCTS if multiply is np.matmul else HALVES, partial(multiply, *factors)
-                if activate is not None:
-                    yield ACTIVATIONS, activate
-        elif isinstance(owner, mlp.PassBack):
-            for inner, inputs in owner._calls:
-                half = isinstance(getattr(inner, "__self__", None), mlp._Half)
-                part = PRODUCTS if inner is np.matmul else HALVES if half else ACTIVATIONS
-                yield part, partial(inner, *inputs)
+    for call in recording.calls:
+        owner = getattr(call, "__self__", None)
+        if isinstance(owner, mlp.Pass | mlp.PassBack):
+            for inner in owner.calls:
+                function = inner.func if isinstance(inner, partial) else inner
+                half = isinstance(getattr(function, "__self__", None), mlp._Half)
+                named = {np.matmul: PRODUCTS, np.copyto: REST}
+                yield HALVES if half else named.get(function, ACTIVATIONS), inner
         else:
+            function = call.func if isinstance(call, partial) else call
             name = getattr(function, "__name__", str(function))
-            yield (
-                OPTIMISER if name.startswith(("_fused_adam", "lerp")) else REST,
-                partial(function, *arguments, **named),
-            )
+            yield OPTIMISER if name.startswith(("_fused_adam", "lerp")) else REST, call
 
 
 def rows(what: str, unit: str, parts: dict[str, float]) -> list[list[str]]:
