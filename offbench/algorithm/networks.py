@@ -148,7 +148,7 @@ class Network(Parameters):
         weight_decay: float = 0.0,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.sizes, self.runs = (inputs, *hidden, outputs or 1), len(run_seeds)
+        self.sizes = (inputs, *hidden, outputs or 1)
         self.ensemble_size = ensemble_size or 1
         self._squeezed = [axis for axis, size in ((-1, outputs), (0, ensemble_size)) if size is None]
         self.activation, self.norm, self.twice_differentiable = activation, norm, twice_differentiable

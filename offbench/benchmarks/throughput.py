@@ -36,23 +36,20 @@ class Rate:
 
     Attributes:
         updates: updates a second of all runs of a stack together.
-        stack: runs of that stack.
         bytes_per_run: of a checkpoint.
     """
 
     updates: float
-    stack: int
     bytes_per_run: int
 
 
-def measure(spec: RunSpec, env_spec: str, device: str, *, stack: int = 0) -> Rate:
+def measure(spec: RunSpec, env_spec: str, device: str) -> Rate:
     """Time the updates of runs like `spec` on random data of an environment's shapes, for half a second or more.
 
-    Args:
-        stack: runs together; 0 for one on a CPU and for what fits on a GPU.
+    It is one run on a CPU, and a stack of what fits on a GPU.
     """
     with arithmetic(device, spec.precision):
-        runs = stack or (1 if device == "cpu" else stack_size(spec, random_data(env_spec), device))
+        runs = 1 if device == "cpu" else stack_size(spec, random_data(env_spec), device)
         learning = random_stack(load_algorithm(spec.algorithm), [spec.config] * runs, env_spec, device)
         wanted = 2 * RECORDED
         while True:
@@ -65,7 +62,7 @@ def measure(spec: RunSpec, env_spec: str, device: str, *, stack: int = 0) -> Rat
                 break
             wanted = max(2, min(10 * wanted, round(1.2 * SECONDS * wanted / spent)))
     size = sum(t.numel() * t.element_size() for t in learning.run_tensors(0).values())
-    return Rate(wanted * runs / spent, runs, size)
+    return Rate(wanted * runs / spent, size)
 
 
 def operations(spec: RunSpec, env_spec: str) -> float:

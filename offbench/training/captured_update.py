@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Hashable, Mapping
 
 import torch
@@ -32,7 +33,7 @@ class Program:
         self.position = torch.zeros(1, dtype=torch.int64, device=self.device)
         self.indices, self.noise = torch.empty(0), dict[str, Tensor]()
         self.sums: dict[str, Tensor] = {}
-        self.counts: dict[str, int] = {}
+        self.counts: Counter[str] = Counter()  # updates in each of `sums`
         self._names: dict[Hashable, list[str]] = {}  # what each phase logs
         self._graphs: dict[Hashable, torch.cuda.CUDAGraph] = {}
         self._recordings: dict[Hashable, Recording] = {}
@@ -59,8 +60,7 @@ class Program:
             self._graphs[phase].replay()
         else:
             self._warm_up(phase, self._side)
-        for name in self._names[phase]:
-            self.counts[name] = self.counts.get(name, 0) + 1
+        self.counts.update(self._names[phase])
 
     def _captured(self, phase: Hashable) -> None:
         """Do an update on the CPU: the first of a phase as it is, the next ones recorded, the rest replayed.
@@ -140,7 +140,7 @@ class Program:
         means = {name: (self.sums[name] / count).tolist() for name, count in self.counts.items()}
         for total in self.sums.values():
             total.zero_()
-        self.counts = {}
+        self.counts.clear()
         return means
 
     def unlogged(self, run: int) -> Sums:
