@@ -9,18 +9,17 @@ resets them with the segment's seeds and plays the recorded actions again, which
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 
 from offbench.agents.training_folder import TRANSITIONS, TrainingFolder
 from offbench.common import checkpoints
 from offbench.common.arrays import Array
-from offbench.common.checkpoints import keep_newest, load_checkpoint, save_checkpoint
 from offbench.common.files import JsonObject, disk_errors
 from offbench.common.terminal import warn
 
@@ -29,15 +28,14 @@ OPTIMIZERS = ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer")
 
 def transitions_since(model: SAC, step: int) -> dict[str, Array]:
     """Return the transitions recorded after `step`, each [steps, envs, ...]; actions in [-1, 1]."""
-    buffer = model.replay_buffer
-    assert buffer is not None
+    buffer = _buffer(model)
     rows = slice(step // buffer.n_envs, buffer.pos)
     return {name: getattr(buffer, name)[rows] for name in TRANSITIONS}
 
 
 def save_segment_end(folder: TrainingFolder, model: SAC, seconds: float) -> None:
     """Write the checkpoint at the end of a segment, whose transitions are written already."""
-    save_checkpoint(folder.path, model.num_timesteps, _tensors(model), _state(model, seconds))
+    checkpoints.save_checkpoint(folder.path, model.num_timesteps, _tensors(model), _state(model, seconds))
     _keep_newest(folder, model.num_timesteps)
 
 
@@ -49,9 +47,10 @@ def save_within_segment(folder: TrainingFolder, model: SAC, seconds: float) -> N
     tensors["generator"] = torch.get_rng_state()
     numpy_state: Any = np.random.get_state(legacy=False)
     numpy_state["state"]["key"] = numpy_state["state"]["key"].tolist()
-    state = {"numpy": numpy_state, "action_space": model.action_space.np_random.bit_generator.state}
+    generators = {"numpy": numpy_state, "action_space": model.action_space.np_random.bit_generator.state}
+    state = _state(model, seconds) | {"generators": generators}
     with disk_errors(str(folder.path)):
-        save_checkpoint(folder.path, step, _tensors(model) | tensors, _state(model, seconds) | {"generators": state})
+        checkpoints.save_checkpoint(folder.path, step, _tensors(model) | tensors, state)
         _keep_newest(folder, step)
 
 
@@ -59,8 +58,8 @@ def _keep_newest(folder: TrainingFolder, newest: int) -> None:
     """Delete old checkpoints, but not the last one at a segment's end, which does not depend on a replay."""
     for step in checkpoints.steps(folder.path):
         if step % folder.recipe.sac.segment and step != newest:
-            (folder.path / f"checkpoint-{step:09d}.safetensors").unlink(missing_ok=True)
-    keep_newest(folder.path)
+            checkpoints.path_of(folder.path, step).unlink(missing_ok=True)
+    checkpoints.keep_newest(folder.path)
 
 
 def restore(folder: TrainingFolder, model: SAC, start_segment: Callable[[int], None]) -> float:
@@ -79,7 +78,7 @@ def restore(folder: TrainingFolder, model: SAC, start_segment: Callable[[int], N
     """
     segment = folder.recipe.sac.segment
     for step in checkpoints.steps(folder.path):
-        loaded = load_checkpoint(folder.path, step)
+        loaded = checkpoints.load_checkpoint(folder.path, step)
         if loaded is None:
             continue
         tensors, state = loaded
@@ -92,12 +91,13 @@ def restore(folder: TrainingFolder, model: SAC, start_segment: Callable[[int], N
                     "(is it deterministic? another MuJoCo?); resuming from an earlier checkpoint"
                 )
                 continue
-            _restore_generators(model, tensors["generator"], state["generators"])
+            torch.set_rng_state(tensors["generator"])
+            np.random.set_state(state["generators"]["numpy"])
+            model.action_space.np_random.bit_generator.state = state["generators"]["action_space"]
         _load_tensors(model, tensors)
         model.num_timesteps, model._n_updates = step, int(state["n_updates"])
         return float(state["seconds"])
-    if model.replay_buffer is not None:
-        model.replay_buffer.reset()
+    _buffer(model).reset()
     return 0.0
 
 
@@ -129,6 +129,11 @@ def _load_tensors(model: SAC, tensors: dict[str, torch.Tensor]) -> None:
         optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
 
 
+def _buffer(model: SAC) -> ReplayBuffer:
+    assert model.replay_buffer is not None  # SB3 makes it with the model
+    return model.replay_buffer
+
+
 def _temperature(model: SAC) -> torch.Tensor:
     assert model.log_ent_coef is not None  # SB3 learns it unless told otherwise
     return model.log_ent_coef
@@ -144,18 +149,14 @@ def _optimizer(model: SAC, name: str) -> torch.optim.Optimizer:
 
 def _fill_buffer(folder: TrainingFolder, model: SAC, until: int) -> None:
     """Put the transitions of all segments up to `until` into the replay buffer, in order."""
-    buffer = model.replay_buffer
-    assert buffer is not None
-    buffer.reset()
+    _buffer(model).reset()
     segment = folder.recipe.sac.segment
     for end in range(segment, until + 1, segment):
         _append(model, folder.read_transitions(end))
 
 
 def _append(model: SAC, arrays: dict[str, Array]) -> None:
-    buffer = model.replay_buffer
-    assert buffer is not None
-    count = len(arrays["rewards"])
+    buffer, count = _buffer(model), len(arrays["rewards"])
     for name, array in arrays.items():
         getattr(buffer, name)[buffer.pos : buffer.pos + count] = array
     buffer.pos += count
@@ -174,11 +175,3 @@ def _replay_segment(model: SAC, arrays: dict[str, Array]) -> bool:
     _append(model, arrays)
     model._last_obs = observations
     return True
-
-
-def _restore_generators(model: SAC, generator: torch.Tensor, state: JsonObject) -> None:
-    torch.set_rng_state(generator)
-    numpy_state = state["numpy"]
-    key = np.array(numpy_state["state"]["key"], np.uint32)
-    np.random.set_state(numpy_state | {"state": numpy_state["state"] | {"key": key}})
-    model.action_space.np_random.bit_generator.state = json.loads(json.dumps(state["action_space"]))

@@ -20,13 +20,18 @@ KEPT = 2
 _NAME = re.compile(r"checkpoint-(\d{9,})\.safetensors")
 
 
+def path_of(folder: Path, step: int) -> Path:
+    """Return the file of a checkpoint."""
+    return folder / f"checkpoint-{step:09d}.safetensors"
+
+
 def save_checkpoint(folder: Path, step: int, tensors: dict[str, torch.Tensor], state: JsonObject) -> None:
     """Write checkpoint-<step>.safetensors, whole or not at all."""
     saved = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     # one key, because safetensors writes several in any order, and a run's bytes should depend on the run alone
     header = {**state, "sha256": _sha256(saved, state)}
     data = save(saved, metadata={"offbench": json.dumps(header, sort_keys=True)})
-    write_bytes(folder / f"checkpoint-{step:09d}.safetensors", data)
+    write_bytes(path_of(folder, step), data)
 
 
 def steps(folder: Path) -> list[int]:
@@ -41,7 +46,7 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], J
     Raises:
         OffbenchError: it cannot be read for another reason, so that a run does not resume from an older one.
     """
-    path = folder / f"checkpoint-{step:09d}.safetensors"
+    path = path_of(folder, step)
     try:
         with damage(str(path), "is damaged", "using the one before it"):
             os.close(regular(path))  # safe_open would wait for a FIFO
@@ -71,4 +76,4 @@ def load_newest(folder: Path) -> tuple[dict[str, torch.Tensor], JsonObject] | No
 def keep_newest(folder: Path) -> None:
     """Delete all but the newest checkpoints."""
     for step in steps(folder)[KEPT:]:
-        (folder / f"checkpoint-{step:09d}.safetensors").unlink(missing_ok=True)
+        path_of(folder, step).unlink(missing_ok=True)
