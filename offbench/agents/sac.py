@@ -14,6 +14,7 @@ Ctrl-C and SIGTERM save a checkpoint where they arrive, from which a resume ends
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import math
 import sys
@@ -31,9 +32,9 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from offbench.agents.sac_checkpoint import restore, save_segment_end, save_within_segment, transitions_since
+from offbench.agents.sb3_zip import sac_layers
 from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common import checkpoints, seeds
-from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import (
     JsonObject,
@@ -267,12 +268,9 @@ def _end_segment(
             for other in folder.policy_steps():
                 if step - segment < other < step:
                     folder.policy(other).unlink()
-        path = folder.transitions(step)
-        path.parent.mkdir(exist_ok=True)
-        temporary = path.with_name("." + path.name)
         arrays: dict[str, Any] = transitions_since(model, step - segment)
-        np.savez(temporary, **arrays)
-        temporary.replace(path)
+        np.savez(transitions := io.BytesIO(), **arrays)
+        write_bytes(folder.transitions(step), transitions.getvalue())
         write_bytes(folder.rungs, csv_bytes(SCREENED, ([values[key] for key in SCREENED] for values in (*rows, row))))
         save_segment_end(folder, model, seconds)
     return row
@@ -296,16 +294,7 @@ def _export(folder: TrainingFolder, model: SAC) -> Policy:
 
 def export_actor(model: SAC, env_id: str, origin: JsonObject) -> Policy:
     """Return SB3's SAC actor as a policy that needs neither SB3 nor PyTorch."""
-    actor: Any = model.policy.actor
-    linear = [layer for layer in actor.latent_pi if isinstance(layer, torch.nn.Linear)]
-    layers = [(_array(layer.weight).T, _array(layer.bias)) for layer in linear]
-    head = np.concatenate([_array(actor.mu.weight).T, _array(actor.log_std.weight).T], axis=1)
-    layers.append((head, np.concatenate([_array(actor.mu.bias), _array(actor.log_std.bias)])))
-    layers = [(np.ascontiguousarray(w), b) for w, b in layers]
+    layers = sac_layers({name: tensor.numpy().copy() for name, tensor in model.policy.state_dict().items()})
     dim, space = layers[0][0].shape[0], cast(gym.spaces.Box, model.action_space)
     zeros, ones = np.zeros(dim, np.float32), np.ones(dim, np.float32)
-    return Policy("squashed_gaussian", tuple(layers), zeros, ones, space.low, space.high, env_id, origin)
-
-
-def _array(tensor: torch.Tensor) -> Array:
-    return tensor.detach().cpu().numpy().copy()
+    return Policy("squashed_gaussian", layers, zeros, ones, space.low, space.high, env_id, origin)

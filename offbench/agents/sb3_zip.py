@@ -79,8 +79,7 @@ def _layers(path: Path, tensors: Mapping[str, Array]) -> tuple[str, Layers, str,
     """Return kind, layers, name of the algorithm and its default activation."""
     try:
         if "actor.latent_pi.0.weight" in tensors or "actor.mu.weight" in tensors:
-            head = _joined([_layer(tensors, "actor.mu"), _layer(tensors, "actor.log_std")])
-            return "squashed_gaussian", (*_sequence(tensors, "actor.latent_pi"), head), "SAC", "relu"
+            return "squashed_gaussian", sac_layers(tensors), "SAC", "relu"
         if "actor.mu.0.weight" in tensors:
             return "tanh", _sequence(tensors, "actor.mu"), "TD3 or DDPG", "relu"
         if "action_net.weight" in tensors:
@@ -93,6 +92,12 @@ def _layers(path: Path, tensors: Mapping[str, Array]) -> tuple[str, Layers, str,
     except (KeyError, ValueError, IndexError) as error:
         raise OffbenchError(f"{path} is not an MLP policy as SB3 saves it: {error}") from None
     raise OffbenchError(f"{path} holds no policy of SAC, TD3, DDPG, PPO or A2C with an MLP")
+
+
+def sac_layers(tensors: Mapping[str, Array]) -> Layers:
+    """Return the layers of a SAC actor, the last of which has the means and the log stds, from a policy's tensors."""
+    head = _joined([_layer(tensors, "actor.mu"), _layer(tensors, "actor.log_std")])
+    return (*_sequence(tensors, "actor.latent_pi"), head)
 
 
 def _layer(tensors: Mapping[str, Array], name: str) -> tuple[Array, Array]:
