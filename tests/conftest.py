@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -104,6 +105,14 @@ def medium(recorded: Path, home: Path) -> str:
     """The id of a copy of that dataset in the test's own Minari folder."""
     shutil.copytree(recorded, home / "minari", dirs_exist_ok=True)
     return "tiny-medium-v0"
+
+
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Let Ctrl-C work where the tests run in the background of a shell, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

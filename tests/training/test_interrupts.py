@@ -23,14 +23,6 @@ from offbench.training.stack import Stack
 from tests.training.test_resume import assert_same_files, train
 
 
-@pytest.fixture
-def ctrl_c() -> Iterator[None]:
-    """Let Ctrl-C work where the tests run in the background of a shell, which ignores it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 def kill_when(process: subprocess.Popen[bytes], ready: Any, delay: float) -> None:
     """Send SIGKILL a while after `ready()` first holds."""
     deadline = time.monotonic() + 120
