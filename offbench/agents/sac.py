@@ -72,7 +72,8 @@ def train(folder: TrainingFolder, steps: int) -> None:
         KeyboardInterrupt: after Ctrl-C (or whatever SIGTERM raises), once a checkpoint is written.
     """
     with exclusive_lock(folder.path / ".lock", f"{folder.path} is being trained"):
-        remove_leftovers(folder.path)
+        for written in (folder.path, folder.path / "policies", folder.path / "transitions"):
+            remove_leftovers(written)
         _check_identity(folder)
         if max(checkpoints.steps(folder.path), default=0) < steps:
             _train(folder, steps)

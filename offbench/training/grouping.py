@@ -115,22 +115,18 @@ def stack_size(spec: RunSpec, data: Transitions, device: str) -> int:
 
 def _alike(specs: Sequence[RunSpec], datasets: Datasets) -> list[list[RunSpec]]:
     """Group runs by algorithm, environment, shapes, precision and the settings that cannot differ within a stack."""
-    groups: list[list[RunSpec]] = []
-    keys: list[object] = []
+    groups: list[tuple[object, list[RunSpec]]] = []
     for spec in specs:
-        data = datasets[spec.dataset]
-        shared = {name for name, field in fields(type(spec.config)).items() if not field.metadata.get("per_run")}
-        settings = {name: value for name, value in settings_json(spec.config).items() if name in shared}
-        shapes = data.observations.shape[1], data.actions.shape[1]
-        key = (spec.algorithm, spec.precision, settings, shapes)
-        for other, (runs, other_key) in enumerate(zip(groups, keys, strict=True)):
+        data, settings = datasets[spec.dataset], fields(type(spec.config)).items()
+        shared = [getattr(spec.config, name) for name, field in settings if not field.metadata.get("per_run")]
+        key = (spec.algorithm, spec.precision, shared, data.observations.shape[1], data.actions.shape[1])
+        for other_key, runs in groups:
             if key == other_key and same_environment(datasets[runs[0].dataset].env_spec, data.env_spec):
-                groups[other].append(spec)
+                runs.append(spec)
                 break
         else:
-            groups.append([spec])
-            keys.append(key)
-    return groups
+            groups.append((key, [spec]))
+    return [runs for _, runs in groups]
 
 
 def pending(job: Job, datasets: Datasets, *, command: str = "") -> list[Job]:

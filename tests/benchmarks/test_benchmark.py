@@ -19,7 +19,7 @@ from offbench.analysis.results import read_results
 from offbench.benchmarks.benchmark import LocalExecutor, benchmark, shard_of
 from offbench.benchmarks.grid import load_grid, shipped_grids
 from offbench.benchmarks.plan import Plan, prepare
-from offbench.benchmarks.throughput import operations
+from offbench.benchmarks.throughput import Rate, operations
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.common.settings import fields as settings_of
@@ -66,6 +66,14 @@ def silent(_: str) -> None:
     """Take a line of the plan and drop it."""
 
 
+@pytest.fixture
+def unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let plans name costs at once instead of measuring them."""
+    monkeypatch.setattr("offbench.benchmarks.plan.measure", lambda *_: Rate(updates=1000.0, bytes_per_run=10**6))
+    monkeypatch.setattr("offbench.benchmarks.plan.operations", lambda *_: 1e9)
+
+
+@pytest.mark.usefixtures("unmeasured")
 def test_the_papers_grid_is_its_table() -> None:
     """15 datasets x (TD3+BC, CQL, four BDB) x 5 seeds = 450 runs of a million updates."""
     bench = prepare("paper", workers=1)
@@ -81,6 +89,7 @@ def test_the_papers_grid_is_its_table() -> None:
     assert {source.level for source in bench.grid.datasets} == set(offbench.inventory()["levels"])
 
 
+@pytest.mark.usefixtures("unmeasured")
 @pytest.mark.parametrize("name", shipped_grids())
 def test_shipped_grids_are_sound_and_their_plan_counts_what_is_left(name: str) -> None:
     bench = prepare(name, workers=2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -261,7 +262,7 @@ def test_an_edit_of_a_package_and_another_version_are_noticed(home: Path) -> Non
     assert changes(before, code()) == "mypackage/parts.py has changed, version of mypackage was 1.0, is 1.1"
 
 
-def test_runs_of_one_script_are_known_by_the_class_alone(home: Path) -> None:
+def test_runs_of_one_script_are_known_by_the_class_alone(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = """
 from offbench.algos.bc import BC
 from offbench.training.source_code import code_of
@@ -275,8 +276,8 @@ print(code_of(use(Mine)))
     found = []
     for body in ("pass", "pass  # a comment", "x = 1"):
         (home / "script.py").write_text(text.format(body))
-        done = subprocess.run([sys.executable, "script.py"], capture_output=True, text=True, check=True)
-        found.append(done.stdout)
+        runpy.run_path("script.py", run_name="__main__")
+        found.append(capsys.readouterr().out)
     assert "Mine" in found[0]
     assert "bc.py" in found[0]
     assert found[0] == found[1] != found[2]
