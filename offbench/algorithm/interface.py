@@ -4,7 +4,7 @@
                                 reads batch_size, normalize and, if there is one, top (share of best episodes)
     setup(c)                    makes the networks; every one that is an attribute is part of a checkpoint
     noise_spec(c)               the random numbers of one update, by name
-    phase(step)                 which sort of update comes at a step
+    phase(step)                 the kind of update at a step
     update(batch, noise, phase) one update, in place; returns {name: [runs]}, the columns of losses.csv
     policy(run)                 the policy file's kind and layers
 
@@ -95,7 +95,7 @@ class PolicyParts(NamedTuple):
 
 
 class Learned(Protocol):
-    """Something whose tensors belong into a checkpoint: a network, a target, a temperature."""
+    """Something whose tensors belong in a checkpoint: a network, a target, a temperature."""
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors by name, each [ensemble, runs, ...] or []: a resume writes into them."""
@@ -148,7 +148,7 @@ class Algorithm(Generic[C]):
         return {}
 
     def phase(self, step: int) -> Hashable:
-        """Return which sort of update comes at `step`, from 0. All updates of a phase do the same operations."""
+        """Return the kind of update at `step`, from 0. All updates of a phase do the same operations."""
         return None
 
     def update(self, batch: Batch, noise: Noise, phase: Any) -> Logs:
@@ -243,7 +243,7 @@ def _learned(prefix: str, values: Mapping[Any, Any]) -> Iterator[tuple[str, Lear
 
 
 def check_logs(logs: object, runs: int, where: str) -> None:
-    """Raise OffbenchError if an update returned something else than logs, each a tensor [runs]; reads shapes alone."""
+    """Raise OffbenchError unless an update returned logs, each a tensor [runs]; reads shapes alone."""
     if not isinstance(logs, Mapping):
         raise OffbenchError(f"{where} must return a dict of logs, not a {type(logs).__name__}")
     for name, value in logs.items():

@@ -31,6 +31,7 @@ from offbench.envs.recipes import load_recipe
 from offbench.training.spec import Times
 
 MOST_SEEDS = 100_000  # a larger count is a typing error, and would fill the memory
+LONGEST_LABEL = 60
 
 
 @dataclass(frozen=True)
@@ -47,9 +48,6 @@ class Source:
     level: str = ""
     steps: int | None = None
     seed: int = 0
-
-
-LONGEST_LABEL = 60
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""IQL, ReBRAC and BEAR against the papers' equations, computed once more in float64 with torch.nn alone.
+"""TD3+BC, BDB, IQL, ReBRAC and BEAR against the papers' equations, computed once more in float64 with torch.nn alone.
 
 Two runs with different settings and seeds in one stack, 200 updates: losses and all parameters agree.
 """
@@ -19,11 +19,12 @@ OBS, ACT, BATCH, UPDATES = 5, 3, 16, 200
 ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
 
 
-def networks(stacked: Any, run: int) -> list[nn.Module]:
-    """One run's networks of a stacked one, read from its flat tensor, in float64."""
+def networks(weights: Any, run: int) -> list[nn.Module]:
+    """One run's networks of a stacked network or a target, read from its flat tensor, in float64."""
+    stacked = getattr(weights, "source", weights)
     made: list[nn.Module] = []
     for member in range(stacked.ensemble_size):
-        flat, modules = stacked.flat.detach()[member, run].double(), []
+        flat, modules = weights.flat.detach()[member, run].double(), []
 
         def take(*shape: int) -> nn.Parameter:
             nonlocal flat
@@ -60,6 +61,56 @@ def step(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
 def adam(rate: float, *parts: Any) -> torch.optim.Adam:
     every = [list(part.parameters()) if isinstance(part, nn.Module) else [part] for part in parts]
     return torch.optim.Adam([p for part in every for p in part], lr=rate)
+
+
+class TD3BC:
+    def __init__(self, stack: Any, run: int, c: Any) -> None:
+        self.c, self.count = c, 0
+        (self.actor,), (self.actor_target,) = networks(stack.actor, run), networks(stack.actor, run)
+        self.critics, self.targets = networks(stack.critic, run), networks(stack.critic, run)
+        self.actor_adam, self.critic_adam = adam(3e-4, self.actor), adam(3e-4, *self.critics)
+
+    def update(self, b: list[Tensor], noise: dict[str, Tensor]) -> dict[str, Tensor]:
+        (s, a, r, s2, mask, _, _), c = b, self.c
+        with torch.no_grad():
+            a2 = (self.actor_target(s2).tanh() + (0.2 * noise["target"]).clamp(-0.5, 0.5)).clamp(-1, 1)
+            q2 = torch.stack([q(torch.cat([s2, a2], 1))[:, 0] for q in self.targets]).min(0).values
+            y = r + 0.99 * mask * q2
+        logs = {"critic_loss": sum(((q(torch.cat([s, a], 1))[:, 0] - y) ** 2).mean() for q in self.critics)}
+        step(self.critic_adam, logs["critic_loss"])
+        self.count += 1
+        if self.count % 2 == 0:
+            pi = self.actor(s).tanh()
+            q = torch.stack([q(torch.cat([s, pi], 1))[:, 0] for q in self.critics])
+            constraint = self.constraint(s, a, pi, (q.max(0).values - q.min(0).values).detach())
+            logs["actor_loss"] = constraint.mean() - c.alpha / q[0].abs().mean().detach() * q[0].mean()
+            step(self.actor_adam, logs["actor_loss"])
+            polyak([self.actor_target, *self.targets], [self.actor, *self.critics])
+        return logs
+
+    def constraint(self, s: Tensor, a: Tensor, pi: Tensor, spread: Tensor) -> Tensor:
+        return ((pi - a) ** 2).mean(1)
+
+    def parts(self) -> dict[str, list[nn.Module]]:
+        parts = {"actor": [self.actor], "critic": self.critics}
+        return parts | {"actor_target": [self.actor_target], "critic_target": self.targets}
+
+
+class BDB(TD3BC):
+    def __init__(self, stack: Any, run: int, c: Any) -> None:
+        super().__init__(stack, run, c)
+        (self.discriminator,) = networks(stack.discriminator, run)
+        self.discriminator_adam = adam(3e-4, self.discriminator)
+
+    def constraint(self, s: Tensor, a: Tensor, pi: Tensor, spread: Tensor) -> Tensor:
+        real, fake = (self.discriminator(torch.cat([s, x], 1)).sigmoid() for x in (a, pi.detach()))
+        step(self.discriminator_adam, -(torch.log(real) + torch.log(1 - fake)).mean())
+        beta = torch.minimum(torch.ones_like(spread), 1 / spread) if self.c.beta == "adaptive" else self.c.beta
+        d = self.discriminator(torch.cat([s, pi], 1))[:, 0].sigmoid()
+        return beta * -torch.log(d) + (1 - beta) * super().constraint(s, a, pi, spread)
+
+    def parts(self) -> dict[str, list[nn.Module]]:
+        return super().parts() | {"discriminator": [self.discriminator]}
 
 
 class ReBRAC:
@@ -183,6 +234,9 @@ class BEAR:
 
 
 CASES: dict[str, tuple[Callable[..., Any], dict[str, Any], list[dict[str, Any]]]] = {
+    "td3_bc": (TD3BC, {}, [{"alpha": 2.5}, {"alpha": 1.0}]),
+    "bdb": (BDB, {}, [{"beta": 0.3}, {"beta": "adaptive"}]),
+    "bdb of four critics": (BDB, {"critics": 4}, [{"beta": 1.0}, {"beta": "adaptive"}]),
     "iql": (
         IQL,
         {"decay_steps": 300},
@@ -204,9 +258,13 @@ CASES: dict[str, tuple[Callable[..., Any], dict[str, Any], list[dict[str, Any]]]
 @pytest.mark.parametrize("name", CASES)
 def test_an_algorithm_follows_its_float64_reference_for_200_updates(name: str) -> None:
     reference, shared, settings = CASES[name]
-    kind, generator = load_algorithm(name), torch.Generator().manual_seed(1)
+    kind, generator = load_algorithm(name.partition(" ")[0]), torch.Generator().manual_seed(1)
     configs = [kind.Config(hidden=(16, 16), batch_size=BATCH, **shared, **own) for own in settings]
     stack: Any = kind(stack_configs(configs, "cpu"), OBS, ACT, [3, 4], "cpu")
+    if reference is BDB:  # larger Q, so that the critics disagree by more than 1 and adaptive beta leaves its bound
+        with torch.no_grad():
+            stack.critic.flat *= 2.5
+            stack.critic_target.flat.copy_(stack.critic.flat)
     references = [reference(stack, run, config) for run, config in enumerate(configs)]
     start = stack.actor.flat.detach().clone()
 
@@ -229,8 +287,12 @@ def test_an_algorithm_follows_its_float64_reference_for_200_updates(name: str) -
             ours = networks(getattr(stack, part), run)
             for a, b in zip(ours, theirs, strict=True):
                 for p, q in zip(a.parameters(), b.parameters(), strict=True):
-                    torch.testing.assert_close(p, q, rtol=0, atol=2e-4)
+                    torch.testing.assert_close(p, q, rtol=0, atol=1e-5 if issubclass(reference, TD3BC) else 2e-4)
+            # nothing moves what is there for alignment alone
+            assert not getattr(stack, part).flat[..., sum(p.numel() for p in theirs[0].parameters()) :].any()
     assert (stack.actor.flat - start).abs().max() > 1e-2  # it did move
+    if reference is BDB:
+        assert 0.01 < logs["beta"][1].item() < 0.99  # the rule was at work, not at its bound
     if name == "bear":
         values = [one.log_multiplier.item() for one in references]
         torch.testing.assert_close(stack.log_multiplier.value.tolist(), values, rtol=0, atol=1e-4)

@@ -1,4 +1,4 @@
-"""TD3+BC and BDB against an independent float64 reference, and each of their particulars."""
+"""TD3+BC and BDB, each of their particulars; test_references.py has their equations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from torch import Tensor
 
 from offbench.algorithm.interface import Algorithm, Batch, stack_configs
 from offbench.training.registry import load_algorithm
-from tests.reference import Reference, flat
 
 OBS, ACT, BATCH = 5, 2, 32
 HIDDEN = (16, 16)
@@ -46,58 +45,6 @@ def run(algorithm: Algorithm, count: int, runs: int = 1, seed: int = 0) -> list[
     for step, (batch, noise) in enumerate(batches(count, runs, seed)):
         logs.append(updated(algorithm, batch, noise, algorithm.phase(step)))
     return logs
-
-
-def reference_for(algorithm: Any, beta: Any = None) -> Reference:
-    critics = [algorithm.critic.layers(0, member) for member in range(algorithm.critic.ensemble_size)]
-    discriminator = algorithm.discriminator.layers(0) if beta is not None else None
-    return Reference(algorithm.actor.layers(0), critics, discriminator, beta)
-
-
-def follow(reference: Reference, count: int) -> None:
-    for batch, noise in batches(count):
-        s, a, r, s2, masks = (x[0].double() for x in batch[:5])
-        reference.update(s, a, r, s2, 1 - masks, noise["target"][0].double())
-
-
-def check_equal(algorithm: Any, reference: Reference, atol: float = 1e-5) -> None:
-    check_network(algorithm.actor, reference.actor, atol)
-    check_network(algorithm.actor_target, reference.actor_target, atol)
-    for member, (critic, target) in enumerate(zip(reference.critics, reference.critic_targets, strict=True)):
-        check_network(algorithm.critic, critic, atol, member)
-        check_network(algorithm.critic_target, target, atol, member)
-
-
-def check_network(ours: Any, theirs: torch.nn.Module, atol: float = 1e-5, member: int = 0) -> None:
-    expected = flat(theirs)
-    found, behind = ours.flat[member, 0].double().split([len(expected), ours.flat.shape[-1] - len(expected)])
-    torch.testing.assert_close(found, expected, atol=atol, rtol=0)
-    assert not behind.any()  # nothing moves what is there for alignment alone
-
-
-def test_td3_bc_follows_the_float64_reference_for_200_updates() -> None:
-    algorithm = make("td3_bc", [{}])
-    reference = reference_for(algorithm)
-    start = algorithm.actor.flat.detach().clone()
-    run(algorithm, 200)
-    follow(reference, 200)
-    check_equal(algorithm, reference)
-    assert (algorithm.actor.flat - start).abs().max() > 1e-2  # it did move
-
-
-@pytest.mark.parametrize(("beta", "critics"), [(0.3, 2), (1.0, 2), ("adaptive", 2), ("adaptive", 4)])
-def test_bdb_follows_the_float64_reference_for_200_updates(beta: Any, critics: int) -> None:
-    algorithm = make("bdb", [{"beta": beta, "critics": critics}])
-    with torch.no_grad():  # larger Q, so that the critics disagree by more than 1 and adaptive beta leaves its bound
-        algorithm.critic.flat *= 2.5
-        algorithm.critic_target.flat.copy_(algorithm.critic.flat)
-    reference = reference_for(algorithm, beta)
-    logs = run(algorithm, 200)
-    follow(reference, 200)
-    check_equal(algorithm, reference)
-    check_network(algorithm.discriminator, reference.discriminator)
-    if beta == "adaptive":
-        assert 0.01 < logs[-1]["beta"].item() < 0.99  # the rule was at work, not at its bound
 
 
 def test_beta_zero_is_td3_bc_bit_for_bit() -> None:

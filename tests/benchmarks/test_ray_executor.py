@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -113,8 +114,6 @@ def test_nodes_that_share_no_disk_fetch_and_bring_back(
     two_nodes: Any, home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The token's content is not what the nodes find: as on a node with another disk at the same path."""
-    import shutil
-
     nodes, _ = two_nodes
     assert run("local", None)
     shutil.rmtree(home / "minari")  # to be recorded on a node as well
@@ -128,17 +127,6 @@ def test_nodes_that_share_no_disk_fetch_and_bring_back(
     same(home, "local", "ray")
 
 
-OWN_GRID = """
-seeds = 2
-eval_every = 500
-eval_episodes = 2
-datasets = [{id = "mine-v0", env = "inverted-pendulum", level = "medium", steps = 1_000}]
-
-[[algorithms]]
-name = "./mine/algo.py:Mine"
-steps = 3_000
-hidden = [32, 32]
-"""
 ALGO = """
 import losses
 from parts.half import HALF
@@ -158,10 +146,8 @@ def test_an_algorithm_of_ones_own_is_sent_to_the_nodes(
     two_nodes: Any, home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the files beside it; all files are gone before the tasks start, so that no node can read them."""
-    import shutil
-
     nodes, _ = two_nodes
-    (home / "grid.toml").write_text(OWN_GRID)
+    (home / "grid.toml").write_text(GRID.replace("bdb", "./mine/algo.py:Mine"))
     (home / "mine" / "parts").mkdir(parents=True)
     (home / "mine" / "parts" / "half.py").write_text("HALF = 0.5\n")
     (home / "mine" / "algo.py").write_text(ALGO)
