@@ -260,7 +260,7 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
         "references": references,
         "levels": {"medium": medium, "expert": expert},
     }
-    _write(folder, out, rows, evaluator, roles, info)
+    _write(out, evaluator, roles, info)
     ladder = read_ladder(out)
     assert ladder is not None
     return ladder
@@ -275,15 +275,9 @@ def random_reference(recipe: Recipe, seed: int, rollouts: Rollouts) -> dict[str,
     return summary(outcomes) | {"episodes": episodes}
 
 
-def _write(
-    folder: TrainingFolder,
-    out: Path,
-    rows: list[dict[str, float]],
-    evaluator: RungEvaluator,
-    roles: dict[int, str],
-    info: JsonObject,
-) -> None:
+def _write(out: Path, evaluator: RungEvaluator, roles: dict[int, str], info: JsonObject) -> None:
     """Write the ladder to a temporary folder, then rename it; ladder.json, written last, says it is complete."""
+    folder = evaluator.folder
     temporary = out.with_name(f".{out.name}.partial")
     with disk_errors(str(out)):
         shutil.rmtree(temporary, ignore_errors=True)
@@ -291,7 +285,7 @@ def _write(
         for step in roles:
             # rewritten, because policy files of earlier versions have no hash
             load_policy(folder.policy(step)).save(temporary / "policies" / folder.policy(step).name)
-        write_bytes(temporary / "ladder.csv", csv_bytes(COLUMNS, _table(folder, rows, evaluator, roles)))
+        write_bytes(temporary / "ladder.csv", csv_bytes(COLUMNS, _table(evaluator, roles)))
         info["medium_replay"] = save_replay(
             temporary / "medium-replay.hdf5", replay_episodes(folder, info["levels"]["medium"])
         )
@@ -304,21 +298,20 @@ def _write(
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _table(
-    folder: TrainingFolder, rows: list[dict[str, float]], evaluator: RungEvaluator, roles: dict[int, str]
-) -> Iterator[list[str | float]]:
+def _table(evaluator: RungEvaluator, roles: dict[int, str]) -> Iterator[list[str | float]]:
     """Yield a row for every rung, and for the policies within segments that were measured.
 
     Returns are as measured where they were measured, as screened elsewhere; `episodes` says which.
     """
     screened = {
-        int(row["step"]): {key.removeprefix("stochastic_"): value for key, value in row.items()} for row in rows
+        step: {key.removeprefix("stochastic_"): value for key, value in row.items()}
+        for step, row in evaluator.screened.items()
     }
-    times = [row["hours"] for row in rows]
+    times = [row["hours"] for row in screened.values()]
     measured = {step for step in evaluator.measured if step <= max(screened)}
     for step in sorted(screened.keys() | measured):
         hours = round(float(np.interp(step, list(screened), times)), 4)
         values: dict[str, str | float] = {"step": step, "hours": hours, **screened.get(step, {})}
         values |= evaluator.measured.get(step, {})
-        values |= {"role": roles.get(step, ""), "policy": folder.policy(step).name if step in roles else ""}
+        values |= {"role": roles.get(step, ""), "policy": evaluator.folder.policy(step).name if step in roles else ""}
         yield [values[key] for key in COLUMNS]

@@ -32,7 +32,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import write_bytes
 from offbench.common.processes import environment
 from offbench.data import minari_store
-from offbench.training.jobs import JobProgress, is_over, raise_first, train_job
+from offbench.training.jobs import JobProgress, raise_first, train_job
 from offbench.training.registry import own_algorithm, use
 from offbench.training.source_code import own_modules
 from offbench.training.spec import Job, RunSpec
@@ -103,7 +103,7 @@ class RayExecutor:
         with JobProgress(jobs) as progress, _token(common) as token:
             while waiting or active:
                 for index in waiting:
-                    if not is_over(jobs[index]):
+                    if not jobs[index].is_over:
                         active[self._start(jobs[index], index, token)] = index
                 waiting = []
                 for ref in self.ray.wait(list(active), num_returns=1, timeout=POLL)[0] if active else ():

@@ -10,7 +10,6 @@ import collections
 import contextlib
 import multiprocessing
 import os
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
@@ -107,7 +106,7 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
 
 
 def _train_here(job: Job, index: int, progress: JobProgress) -> list[str]:
-    if is_over(job):
+    if job.is_over:
         return []
     try:
         return train_job(job, lambda step, note: progress.report(index, step, note))
@@ -115,11 +114,6 @@ def _train_here(job: Job, index: int, progress: JobProgress) -> list[str]:
         if len(progress.jobs) == 1:
             raise
         return [str(error)]
-
-
-def is_over(job: Job) -> bool:
-    """Return whether a job's deadline has passed."""
-    return job.deadline is not None and time.time() > job.deadline
 
 
 class _Pool(contextlib.AbstractContextManager["_Pool"]):
@@ -166,7 +160,7 @@ def _train_in_processes(jobs: Sequence[Job], processes: int, pool: _Pool) -> Ite
     while waiting or pool.active:
         while waiting and len(pool.active) < processes:
             index, job = waiting.popleft()
-            if not is_over(job):
+            if not job.is_over:
                 pool.start(index, job)
         # if all remaining jobs are over, there is no process to wait for
         for receiver in wait(list(pool.active)) if pool.active else ():

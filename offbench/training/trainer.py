@@ -106,7 +106,7 @@ class Trainer:
         if self.stops:
             return False
         for step in self.stack.train(stop):
-            late = self.job.deadline is not None and time.time() > self.job.deadline and step < stop
+            late = self.job.is_over and step < stop
             if step % LOG_EVERY == 0 or step == stop:
                 for rows, row in zip(self.losses, self.stack.logged(), strict=True):
                     rows.append({"step": step, **row})

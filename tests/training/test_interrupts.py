@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -54,25 +54,30 @@ def test_training_survives_kill_9(medium: str, home: Path) -> None:
         assert_same_files(killed, whole)
 
 
+def interrupted(*sent: int) -> Callable[[Stack, int], Iterator[int]]:
+    """Return a `Stack.train` that sends signals to this process at step 300."""
+    train_on = Stack.train
+
+    def until_300(stack: Stack, until: int) -> Iterator[int]:
+        for step in train_on(stack, until):
+            for number in sent if step == 300 else ():
+                signal.raise_signal(number)
+            yield step
+
+    return until_300
+
+
 @pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_and_sigterm_save_a_checkpoint_where_they_arrive(
     medium: str, sent: int, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train_on = Stack.train
-
-    def interrupted(stack: Stack, until: int) -> Iterator[int]:
-        for step in train_on(stack, until):
-            if step == 300:
-                signal.raise_signal(sent)
-            yield step
-
     (whole,) = train("td3_bc", medium, "whole", 600, eval_every=200)
     words = ["train", "td3_bc", "--dataset", medium, "--steps", "600", "--eval-every", "200", "--eval-episodes", "2"]
     words += ["--workers", "1", "--hidden", "16,16", "--batch-size", "32"]
     capsys.readouterr()
     with monkeypatch.context() as patched:
-        patched.setattr(Stack, "train", interrupted)
+        patched.setattr(Stack, "train", interrupted(sent))
         with pytest.raises(SystemExit) as stopped:
             main(words)
     run = Run(Path("runs") / whole.folder.relative_to("whole"))
@@ -88,16 +93,7 @@ def test_ctrl_c_and_sigterm_save_a_checkpoint_where_they_arrive(
 
 @pytest.mark.usefixtures("ctrl_c")
 def test_a_second_ctrl_c_does_not_wait_for_a_checkpoint(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    train_on = Stack.train
-
-    def interrupted(stack: Stack, until: int) -> Iterator[int]:
-        for step in train_on(stack, until):
-            if step == 300:
-                signal.raise_signal(signal.SIGINT)
-                signal.raise_signal(signal.SIGINT)
-            yield step
-
-    monkeypatch.setattr(Stack, "train", interrupted)
+    monkeypatch.setattr(Stack, "train", interrupted(signal.SIGINT, signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         train("td3_bc", medium, "runs", 600, eval_every=200)
     (run,) = find_runs(Path("runs"))
