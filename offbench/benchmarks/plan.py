@@ -112,7 +112,6 @@ class Plan:
     def __init__(self, bench: Benchmark) -> None:
         self.bench = bench
         self.update_seconds: dict[str, float] = {}
-        self._seconds = self._disk = self._products = 0.0  # of the lines so far
 
     def __iter__(self) -> Iterator[str]:
         bench = self.bench
@@ -131,7 +130,7 @@ class Plan:
         env_specs = {"": given} if given else env_specs or {"": _recorded_env_spec(bench.grid.datasets[0])}
         env_spec = next(iter(env_specs.values()))  # for the shapes, which differ little
         play = float(np.mean([step_seconds(text) for text in env_specs.values()]))
-        self._seconds = self._disk = self._products = 0.0
+        self._seconds = self._disk = self._products = 0.0  # of the lines so far
         to_train = [specs for specs in left if specs]
         widths = max(len(_name(specs[0])) for specs in to_train), max(len(f"{specs[0].steps:,}") for specs in to_train)
         for specs in to_train:

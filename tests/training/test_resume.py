@@ -22,6 +22,7 @@ from offbench.training.registry import algorithm_names
 from offbench.training.run import Run, Session
 
 SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 100, "eval_episodes": 2, "workers": 1}
+HALF: dict[str, Any] = {"precision": "bfloat16", "hidden": (64, 64)}  # a CPU multiplies narrower layers in float32
 EXTRA: dict[str, dict[str, Any]] = {
     "td3_bc": {},
     "bdb": {},
@@ -49,27 +50,31 @@ def assert_same_files(one: Run, other: Run) -> None:
         assert (one.folder / name).read_bytes() == (other.folder / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("algorithm", sorted(EXTRA))
-def test_a_run_stopped_and_resumed_ends_with_the_same_bits(medium: str, algorithm: str, precision: str) -> None:
-    (whole,) = train(algorithm, medium, "whole", 300, precision=precision)
-    assert whole.config().precision == precision
+@pytest.mark.parametrize(
+    ("algorithm", "more"), [*((algorithm, {}) for algorithm in sorted(EXTRA)), ("bdb", HALF), ("rebrac", HALF)]
+)
+@pytest.mark.usefixtures("bfloat16")
+def test_a_run_stopped_and_resumed_ends_with_the_same_bits(medium: str, algorithm: str, more: dict[str, Any]) -> None:
+    (whole,) = train(algorithm, medium, "whole", 300, **more)
+    assert whole.config().precision == more.get("precision", "float32")
     for steps in (100, 200, 300):
-        (pieces,) = train(algorithm, medium, "pieces", steps, precision=precision)
+        (pieces,) = train(algorithm, medium, "pieces", steps, **more)
     assert_same_files(whole, pieces)
 
 
-def test_a_run_alone_equals_the_same_run_in_a_stack(medium: str, precision: str) -> None:
+@pytest.mark.parametrize("more", [{}, HALF])
+@pytest.mark.usefixtures("bfloat16")
+def test_a_run_alone_equals_the_same_run_in_a_stack(medium: str, more: dict[str, Any]) -> None:
     """From the data to the weights: batches, noise and initial weights depend on the run's own seed alone."""
-    stack = train("bdb", medium, "stack", 200, seeds=[3, 4, 5], precision=precision)
+    stack = train("bdb", medium, "stack", 200, seeds=[3, 4, 5], **more)
     for run in stack:
-        (alone,) = train("bdb", medium, "alone", 200, seeds=run.config().seed, precision=precision)
+        (alone,) = train("bdb", medium, "alone", 200, seeds=run.config().seed, **more)
         assert_same_files(run, alone)
 
 
-def test_each_precision_has_runs_of_its_own(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("offbench.training.devices.has_bfloat16", lambda: True)
-    wide = {"hidden": (64, 64)}  # a CPU multiplies narrower layers in float32 in either
-    one, other = (train("td3_bc", medium, "runs", 100, precision=name, **wide)[0] for name in ("float32", "bfloat16"))
+@pytest.mark.usefixtures("bfloat16")
+def test_each_precision_has_runs_of_its_own(medium: str) -> None:
+    one, other = (train("td3_bc", medium, "runs", 100, **HALF | {"precision": p})[0] for p in ("float32", "bfloat16"))
     assert other.config().variant == f"{one.config().variant},precision=bfloat16"
     assert one.policy_path.read_bytes() != other.policy_path.read_bytes()
     labels = [method.label for method in read_results("runs").methods]
