@@ -28,7 +28,7 @@ from offbench.rollouts.policy import Policy, load_policy
 
 BEHAVIOUR = Path("behaviour")  # where trainings live unless the user says otherwise
 MEDIUM = 1 / 3  # of the expert's normalized return
-MEDIUM_AT_MOST = 0.45  # a rung beyond this is no medium while there is another
+MEDIUM_AT_MOST = 0.45  # a rung beyond this is chosen as medium only if there is no other
 MEDIUM_LIMITS = (0.2, 0.6)  # a medium beyond these is recorded only if the user accepts it
 NEAR = 0.05  # a rung this near a wanted fraction is taken for it; others only if the user accepts them
 POLICY_NAME = re.compile(r"\w[\w.-]*\.safetensors")  # a file of the ladder's own folder, nothing else

@@ -257,7 +257,7 @@ def _end_segment(
 ) -> dict[str, float]:
     """Screen the rung at the end of a segment and write what the segment made; return its row of rungs.csv.
 
-    The checkpoint comes last, and with it the segment counts.
+    The checkpoint is written last: only then is the segment complete.
     """
     step, segment = model.num_timesteps, folder.recipe.sac.segment
     policy = _export(folder, model)

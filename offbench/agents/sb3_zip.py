@@ -1,7 +1,7 @@
 """The policy in a zip that Stable-Baselines3 saved: SAC, TD3, DDPG, PPO and A2C with MLP policies.
 
 Such a zip holds pickled data, which can run anything when it is loaded. Only two members are read here: policy.pth, by
-`torch.load(weights_only=True)`, which makes tensors alone, and `data`, as JSON text, for the name of the activation.
+`torch.load(weights_only=True)`, which loads only tensors, and `data`, as JSON text, for the name of the activation.
 """
 
 from __future__ import annotations

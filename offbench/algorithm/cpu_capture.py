@@ -93,12 +93,12 @@ class Recording:
         self.calls.append(call)
 
     def changed(self, tensors: Nested) -> None:
-        """Note that a call changes tensors in place: they are no constants."""
+        """Note that a call changes tensors in place, so that they are not constants."""
         for tensor in _tensors(tensors):
             self._constants.pop(_address(tensor), None)
 
     def finish(self) -> None:
-        """Leave out of the replay what only fills constants."""
+        """Remove the calls that only fill constants from the replay."""
         left_out = set(self._constants.values())
         self.calls = [call for index, call in enumerate(self.calls) if index not in left_out]
 
@@ -142,7 +142,7 @@ def record(update: Callable[[], object]) -> Recording:
 
 @contextmanager
 def one_call() -> Iterator[Recording | None]:
-    """Make what is done within one call of the record, which the caller adds to it; None if nothing is recorded."""
+    """Record what is done within as one call, which the caller adds to the recording; yield None if there is none."""
     recording: Recording | None = getattr(_ACTIVE, "recording", None)
     if recording is None:
         yield None
@@ -200,7 +200,7 @@ def changed_attribute(before: dict[str, object], after: dict[str, object], *, fi
 
 
 def _state(value: object, above: frozenset[int]) -> object:
-    """Return what of a value can change, as something comparable."""
+    """Return the parts of a value that can change, in a form that can be compared."""
     if value is None or isinstance(value, bool | int | float | complex | str | bytes):
         return type(value).__name__, repr(value)  # NaN equals itself so
     if id(value) in above or isinstance(value, type | Tensor) or callable(getattr(value, "tensors", None)):

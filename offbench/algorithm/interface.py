@@ -84,7 +84,7 @@ class PolicyParts(NamedTuple):
 
     Attributes:
         activation: between the layers, `relu` or `tanh`.
-        critic, samples: for the kind `best_by_q` alone: Q of (observation, action), and how many to choose from.
+        critic, samples: only for the kind `best_by_q`: Q of (observation, action), and how many to choose from.
     """
 
     kind: str
@@ -110,8 +110,8 @@ class Algorithm(Generic[C]):
         run_seeds: one seed for each run.
 
     Attributes:
-        capture: whether updates may be recorded and replayed, which is faster. A replay repeats tensor operations
-            alone, so all updates of a phase must do the same.
+        capture: whether updates may be recorded and replayed, which is faster. A replay repeats only tensor
+            operations, so all updates of a phase must do the same ones.
         uses_next_actions: whether batches hold `next_actions`.
     """
 
@@ -243,7 +243,7 @@ def _learned(prefix: str, values: Mapping[Any, Any]) -> Iterator[tuple[str, Lear
 
 
 def check_logs(logs: object, runs: int, where: str) -> None:
-    """Raise OffbenchError unless an update returned logs, each a tensor [runs]; reads shapes alone."""
+    """Raise OffbenchError unless an update returned logs, each a tensor [runs]; reads only shapes."""
     if not isinstance(logs, Mapping):
         raise OffbenchError(f"{where} must return a dict of logs, not a {type(logs).__name__}")
     for name, value in logs.items():

@@ -25,8 +25,8 @@ from offbench.common import seeds
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import Purpose
 
-# What a run learns is stored in multiples of this many numbers, so that each run begins where a processor's wide
-# registers do: loops round what is left at their end differently, and a run must be the same alone and in a stack.
+# The numbers that a run learns are padded to a multiple of this, so that each run is aligned with a processor's vector
+# registers: vectorized loops round their last elements differently, and a run must be the same alone and in a stack.
 ALIGNED = 16
 
 Schedule = Callable[[Tensor], Tensor]  # from the number of earlier steps, a tensor [], to the learning rate
@@ -80,7 +80,7 @@ class Parameters:
         return self.flat[0, :, 0] if self._scalar else self.flat[0]
 
     def minimize(self, loss: Tensor, retain_graph: bool = False) -> None:
-        """Take one Adam step down the gradient of `loss` [runs], for these parameters alone."""
+        """Take one Adam step down the gradient of `loss` [runs], for these parameters only."""
         minimize(loss, self, retain_graph=retain_graph)
 
     @torch.no_grad()
@@ -106,7 +106,7 @@ class Parameters:
         )
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return what a checkpoint keeps, each [ensemble, runs, P] but for the step count."""
+        """Return what a checkpoint keeps, each [ensemble, runs, P] except the step count."""
         return {"flat": self._whole, **self.state}
 
 
@@ -124,7 +124,7 @@ class Network(Parameters):
         inputs: width of the inputs, concatenated.
         hidden: widths of the hidden layers.
         outputs: width of the outputs; None for one number, whose axis is left out.
-        run_seeds: one seed for each run; a run's weights depend on its seed and on `index` alone.
+        run_seeds: one seed for each run; a run's weights depend only on its seed and on `index`.
         index: tells an algorithm's networks apart.
         ensemble_size: perceptrons for each run; None for one, whose axis is left out.
         activation: of the hidden layers, relu or tanh.

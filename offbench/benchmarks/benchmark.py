@@ -107,7 +107,7 @@ def _seconds(text: str) -> float:
 
 
 def shard_of(bench: Benchmark, shard: tuple[int, int]) -> list[RunSpec]:
-    """Return a shard's runs: a share of each variant, by the grid alone, as the machines may differ.
+    """Return a shard's runs: a share of each variant. It depends only on the grid, because the machines may differ.
 
     Raises:
         OffbenchError: there is no such shard.

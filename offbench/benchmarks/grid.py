@@ -128,7 +128,7 @@ def _times(values: JsonObject, default: Times, where: str) -> Times:
 
 
 def _source(value: object, folder: Path, where: str) -> Source:
-    """Return a dataset from its id alone (a shipped recipe's level) or from a table; `folder` is the grid's."""
+    """Return a dataset from its id (a shipped recipe's level) or from a table; `folder` is the grid's."""
     if isinstance(value, dict):
         source = build(Source, value, f"{where}: datasets")
         parse_level(source.level or "medium")

@@ -226,7 +226,7 @@ def _shared(token: str) -> bool:
 
 @contextmanager
 def _own_folder() -> Iterator[Path]:
-    """Yield a folder of this task alone, which Minari's datasets and the cache are in too."""
+    """Yield a temporary folder for this task, which also holds Minari's datasets and the cache."""
     with (
         tempfile.TemporaryDirectory(prefix="offbench-") as name,
         environment({"MINARI_DATASETS_PATH": f"{name}/minari", "OFFBENCH_CACHE": f"{name}/cache"}),

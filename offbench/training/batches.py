@@ -2,7 +2,7 @@
 
     chunk of CHUNK updates:  per run, from (run seed, chunk):  indices [CHUNK, runs, batch], noise [CHUNK, runs, ...]
 
-A run's random numbers depend on its own seed, the chunk and the kind of device alone: it is the same run alone or
+A run's random numbers depend only on its own seed, the chunk and the kind of device. So it is the same run alone and
 in a stack, and a resume needs no generator state.
 """
 

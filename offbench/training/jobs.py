@@ -42,7 +42,7 @@ def train_job(job: Job, report: Report) -> list[str]:
 def run_jobs(jobs: Sequence[Job], processes: int) -> list[str]:
     """Train jobs, up to `processes` at a time; a job that fails does not stop the others.
 
-    One job alone on a CPU has the other processes for its evaluations.
+    A single job on a CPU uses the other processes for its evaluations.
 
     Returns:
         What went wrong, a line each.

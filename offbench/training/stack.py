@@ -122,7 +122,7 @@ def _check_policy(algorithm: Algorithm, observation_dim: int, action_dim: int) -
     try:
         check_networks(parts, observation_dim, action_dim)
         ready = not any(x.requires_grad or x.is_cuda for layer in [*parts.layers, *parts.critic] for x in layer)
-    except (ValueError, TypeError, AttributeError) as error:  # the last two: layers that are no pairs of tensors
+    except (ValueError, TypeError, AttributeError) as error:  # the last two: layers that are not pairs of tensors
         raise OffbenchError(f"{where}: {error}") from None
     if not ready:
         raise OffbenchError(f"{where}: layers must be detached and on the CPU, as `Network.layers` returns them")

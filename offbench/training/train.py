@@ -56,7 +56,7 @@ def train(
         dataset: one id of a local Minari dataset, or several.
         env: the recipe's name or file of the environment to evaluate in, instead of the one that the dataset names.
         download: fetch datasets that are not here from Minari's server first.
-        seeds: one seed or several; a run's random numbers depend on its own seed alone.
+        seeds: one seed or several; a run's random numbers depend only on its own seed.
         steps: updates of each run.
         eval_every, eval_episodes: updates between evaluations, and episodes of the deterministic policy in each.
         device: auto, cpu, cuda or cuda:N.

@@ -58,7 +58,7 @@ class Trainer:
         self.rollouts: Rollouts | None = None
         self.note = ""
         self.diverged: dict[int, str] = {}  # runs that have diverged, and what to tell the user
-        self.stops: list[int] = []  # Ctrl-C and SIGTERM, as they came
+        self.stops: list[int] = []  # signals received: Ctrl-C and SIGTERM
         self._saved, self._save_seconds = time.monotonic(), 0.0  # when the last checkpoint was written, and how fast
 
     def train(self, report: Report) -> list[str]:
