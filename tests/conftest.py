@@ -87,7 +87,7 @@ def forget_modules(folder: Path) -> None:
 
 
 @pytest.fixture(scope="session")
-def recorded(tiny: tuple[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded_once(tiny: tuple[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A Minari folder with a small dataset of the tiny recipe."""
     import offbench
 
@@ -100,9 +100,9 @@ def recorded(tiny: tuple[str, str], tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.fixture
-def medium(recorded: Path, home: Path) -> str:
+def medium(recorded_once: Path, home: Path) -> str:
     """The id of a copy of that dataset in the test's own Minari folder."""
-    shutil.copytree(recorded, home / "minari", dirs_exist_ok=True)
+    shutil.copytree(recorded_once, home / "minari", dirs_exist_ok=True)
     return "tiny-medium-v0"
 
 
