@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from offbench.agents.ladder import read_ladder
+from offbench.agents.ladder import BEHAVIOUR, folder_of, read_ladder
 from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import Entry, entries_of, read_results
 from offbench.analysis.statistics import iqm
@@ -87,7 +87,7 @@ def _row(entry: Entry, twins: bool) -> Row:
     return row
 
 
-def score_returns(env: str, returns: Sequence[float], behaviour_dir: str | Path = "behaviour") -> list[Row]:
+def score_returns(env: str, returns: Sequence[float]) -> list[Row]:
     """Return one row for each return: its score by our reference (if there is a ladder) and by D4RL's constants.
 
     Raises:
@@ -96,10 +96,9 @@ def score_returns(env: str, returns: Sequence[float], behaviour_dir: str | Path 
     recipe = load_recipe(env)
     if not np.isfinite(returns).all():
         raise OffbenchError(f"returns must be finite numbers, not {list(returns)}")
-    folders = [recipe.folder / "behaviour"] if recipe.folder else []
-    folders.append(Path(behaviour_dir) / recipe.name / "seed-0" / "ladder")
-    ladder = next((candidate.check(recipe) for folder in folders if (candidate := read_ladder(folder))), None)
-    ours = (ladder.random_return, ladder.expert_return) if ladder else None
+    shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder else None
+    ladder = shipped or read_ladder(folder_of(recipe, 0, BEHAVIOUR) / "ladder")
+    ours = (ladder.random_return, ladder.expert_return) if ladder and ladder.check(recipe) else None
     d4rl = (recipe.d4rl_min, recipe.d4rl_max) if recipe.d4rl_min is not None else None
     if not ours and not d4rl:
         raise OffbenchError(

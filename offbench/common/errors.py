@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 import re
+import traceback
 from collections.abc import Iterable
 
 NEAR = 0.76  # similarity of two names (difflib): more than iql and cql, less than hoper and hopper
@@ -39,9 +40,6 @@ def unknown(what: str, name: str, valid: Iterable[str]) -> OffbenchError:
 def drawing_variable(error: BaseException) -> str | None:
     """Return the environment variable, as NAME=VALUE, that kept MuJoCo or PyOpenGL from loading; None if none did."""
     given = [f"{name}={os.environ[name]}" for name in DRAWING if os.environ.get(name)]
-    trace, modules = error.__traceback__, set()
-    while trace is not None:
-        modules.add(str(trace.tb_frame.f_globals.get("__name__", "")))
-        trace = trace.tb_next
+    modules = {str(frame.f_globals.get("__name__", "")) for frame, _ in traceback.walk_tb(error.__traceback__)}
     at_fault = any(re.match(r"OpenGL\b|mujoco\..*(gl_context|egl|osmesa|glfw)", name) for name in modules)
     return " and ".join(given) if given and at_fault else None

@@ -49,12 +49,12 @@ class Progress:
         elif kind is None and self.done > self._first and self._printed != self.done:
             self._print()
 
-    def skip(self, done: int, work: float | None = None) -> None:
-        """Add `done` units that an earlier session has done; they do not count for the rate."""
+    def skip(self, done: int, work: float) -> None:
+        """Add `done` steps, and their work, that an earlier session has done; they do not count for the rate."""
         self.done += done
         self._first += done
-        self._worked += done if work is None else work
-        self._first_work += done if work is None else work
+        self._worked += work
+        self._first_work += work
 
     def say(self, line: str) -> None:
         """Print a line of its own, above the bar."""
@@ -64,7 +64,7 @@ class Progress:
             print(line, file=sys.stderr, flush=True)
 
     def to(self, done: int, note: str = "", work: float | None = None) -> None:
-        """Say that `done` units are done, with a note such as the last score."""
+        """Say that `done` steps are done, with a note such as the last score."""
         news = note not in ("", self._note)
         self.done, self._note = done, note or self._note
         self._worked = done if work is None else work

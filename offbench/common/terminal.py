@@ -87,19 +87,18 @@ def _wrapped(text: str, width: int) -> str:
     return "\n".join(lines).replace(GLUE, " ")
 
 
-def print_lines(lines: Iterable[str], stream: TextIO | None = None) -> None:
-    """Print lines of text to stdout (or another stream), such as `return      mean 1197.1, std 355.1`.
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines of text to stdout, such as `return      mean 1197.1, std 355.1`.
 
     On a terminal, labels are in color, and the rest of a long line stands below its text.
     """
-    stream = stream or sys.stdout
-    if not is_terminal(stream):
+    if not is_terminal(sys.stdout):
         for line in lines:
-            print(line, file=stream, flush=True)
+            print(line, flush=True)
         return
     from rich.text import Text
 
-    screen = console(stream)
+    screen = console(sys.stdout)
     for line in map(printable, lines):
         label = LABEL.match(line)
         indent = label.end() if label else len(line) - len(line.lstrip()) + 2

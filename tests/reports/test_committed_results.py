@@ -11,6 +11,7 @@ import offbench
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("runs", sorted(RESULTS.glob("*/runs")), ids=lambda path: path.parent.name)
 def test_the_committed_tables_are_those_of_the_committed_runs(runs: Path) -> None:
     offbench.report(runs, "again")

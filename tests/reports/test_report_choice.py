@@ -12,6 +12,8 @@ from offbench.common.errors import OffbenchError
 from tests.made_runs import METHODS, made_grid, made_run
 from tests.pages import Page, rows
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 def scored(
     root: Path, algorithm: str, variant: str, value: float, seeds: int = 2, dataset: str = "x-medium-v0"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -12,17 +11,11 @@ import gymnasium
 import mujoco
 import pytest
 
+from offbench.cli.main import main
 from offbench.common.provenance import versions
 from offbench.tools import doctor
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]
-
-
-def states(done: subprocess.CompletedProcess[str]) -> dict[str, set[str]]:
-    found: dict[str, set[str]] = {}
-    for row in json.loads(done.stdout):
-        found.setdefault(row["name"], set()).add(row["state"])
-    return found
 
 
 def test_a_sound_machine_has_nothing_broken(offbench_cli: Cli) -> None:
@@ -33,17 +26,18 @@ def test_a_sound_machine_has_nothing_broken(offbench_cli: Cli) -> None:
     assert "broken" not in done.stdout
 
 
-def test_folders_that_cannot_be_written_are_broken(offbench_cli: Cli, home: Path) -> None:
+def test_folders_that_cannot_be_written_are_broken(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     (home / "file").write_text("not a folder")
-    environment = dict(os.environ) | {
-        "MINARI_DATASETS_PATH": str(home / "file" / "minari"),
-        "OFFBENCH_CACHE": "/proc/x",
-    }
-    done = offbench_cli("doctor", "--json", env=environment)
-    assert done.returncode == 1
-    found = states(done)
-    assert found["datasets"] == found["cache"] == {"broken"}
-    assert found["physics"] == found["runs"] == {"ok"}
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(home / "file" / "minari"))
+    monkeypatch.setenv("OFFBENCH_CACHE", "/proc/x")
+    with pytest.raises(SystemExit) as stopped:
+        main(["doctor", "--json"])
+    assert stopped.value.code == 1
+    found = {row["name"]: row["state"] for row in json.loads(capsys.readouterr().out)}
+    assert found["datasets"] == found["cache"] == "broken"
+    assert found["physics"] == found["runs"] == "ok"
 
 
 def test_the_physics_check_sees_other_physics(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,9 +53,9 @@ def test_the_physics_check_sees_other_physics(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(gymnasium, "make", lighter)
     assert doctor.replay_error(16) > 1e-5
     monkeypatch.setattr(doctor, "TOLERANCE", 1e-5)
-    (finding,) = [f for f in doctor.doctor() if f.name == "physics"]
-    assert finding.state == "broken"
-    assert "mujoco" in finding.text
+    ((state, text),) = doctor._physics()
+    assert state == "broken"
+    assert "mujoco" in text
 
 
 def test_a_broken_algorithm_and_a_missing_package_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,7 +73,7 @@ def test_no_renderer_is_worth_a_note_and_names_the_packages(monkeypatch: pytest.
     from offbench.evaluation import renderer
 
     monkeypatch.setattr(renderer, "working_backend", lambda: None)
-    (finding,) = [f for f in doctor.doctor() if f.name == "renderer"]
-    assert finding.state == "note"
-    assert "libegl1" in finding.text
-    assert "libosmesa6" in finding.text
+    ((state, text),) = doctor._renderer()
+    assert state == "note"
+    assert "libegl1" in text
+    assert "libosmesa6" in text
