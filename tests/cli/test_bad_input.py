@@ -165,6 +165,7 @@ CASES: dict[str, tuple[str, str]] = {
     "export-policy nowhere --out policy.pt": ("no policy file nowhere", ""),
     "export-policy . --out policy.pt": ("no policy file policy.safetensors", ""),
     "export-policy empty.safetensors --out policy.pt": ("not a readable policy file", ""),
+    "completion tcsh": ("invalid choice: 'tcsh'", "bash"),
     "behaviour hoper": ("did you mean 'hopper'?", ""),
     "behaviour hopper --steps 12345": ("steps must be a multiple of 10000", ""),
 }

@@ -1,4 +1,4 @@
-"""`offbench video`: films of policies, where something can draw; the refusals, everywhere."""
+"""`offbench video`: the videos where MuJoCo can render, the error messages everywhere."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ POLICY = next((shipped() / "inverted-pendulum" / "behaviour" / "policies").glob(
 
 @pytest.fixture(scope="module")
 def draws() -> None:
-    """Skip where nothing draws off-screen."""
+    """Skip where MuJoCo cannot render."""
     if renderer.working_backend() is None:
-        pytest.skip("neither EGL nor OSMesa works here: no film was made")
+        pytest.skip("neither EGL nor OSMesa works here: no video was recorded")
 
 
 def frames_of(path: Path) -> list[np.ndarray]:
@@ -51,7 +51,7 @@ def test_a_gif_shows_the_episode_with_step_and_return(offbench_cli: Cli, home: P
 
 @pytest.mark.usefixtures("draws")
 def test_an_mp4_is_a_film_of_its_frames(home: Path) -> None:
-    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed: no mp4 was made")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed: no mp4 was recorded")
     made = video.video("inverted-pendulum:expert", out="film.mp4", episodes=2, seconds=0.8, fps=25, size=96)
     frames, seconds = ffmpeg.count_frames_and_secs(str(made))
     assert frames == 21  # 20 steps and the first frame: --seconds counts for the whole film
