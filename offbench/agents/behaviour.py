@@ -10,6 +10,7 @@ from offbench.agents.sac import train
 from offbench.agents.training_folder import TrainingFolder
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import default_workers
+from offbench.common.seeds import check_seed
 from offbench.envs.recipes import Recipe, load_recipe
 
 
@@ -36,7 +37,7 @@ def behaviour(
     Returns:
         The ladder.
     """
-    recipe = load_recipe(env) if isinstance(env, str) else env
+    recipe, seed = load_recipe(env) if isinstance(env, str) else env, check_seed(seed)
     steps = recipe.sac.steps if steps is None else steps
     segment = recipe.sac.segment
     if steps < segment or steps % segment:

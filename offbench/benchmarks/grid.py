@@ -25,6 +25,7 @@ from pathlib import Path
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import JsonObject, damage, read_text
 from offbench.common.settings import build
+from offbench.common.text import LARGEST
 from offbench.data import minari_store
 from offbench.data.levels import parse_level
 from offbench.envs.recipes import load_recipe
@@ -121,7 +122,7 @@ def _times(values: JsonObject, default: Times, where: str) -> Times:
     seeds = merged.pop("seeds")
     if isinstance(seeds, int) and not isinstance(seeds, bool) and 0 < seeds <= MOST_SEEDS:
         seeds = range(seeds)
-    bad = not isinstance(seeds, Sequence) or any(type(s) is not int or s < 0 for s in seeds)
+    bad = not isinstance(seeds, Sequence) or any(type(s) is not int or not 0 <= s <= LARGEST for s in seeds)
     if bad or len(set(seeds)) != len(seeds) or not len(seeds):
         raise OffbenchError(f"{where}: seeds must be a count or a list of different whole numbers, not {seeds!r}")
     return build(Times, merged | {"seeds": tuple(seeds)}, where)

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 
 from offbench.common.errors import OffbenchError, nearest
 from offbench.common.terminal import is_terminal
+from offbench.common.text import LARGEST, whole_number
 
 HELP_COLUMN = 28  # where the help of an argument begins, at the latest, on a terminal of 80 columns
 
@@ -167,12 +168,14 @@ def natural(text: str) -> int:
 
 def _whole(text: str, least: int) -> int:
     try:
-        value = float(text)
-        if value != int(value) or value < least:
-            raise ValueError
-    except (ValueError, OverflowError):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}") from None
-    return int(value)
+        value = whole_number(text)
+    except ValueError:
+        value = least - 1
+    if value < least:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}")
+    if value > LARGEST:
+        raise argparse.ArgumentTypeError(f"{text!r:.60} is too large a number")
+    return value
 
 
 def share(text: str) -> tuple[int, int]:

@@ -6,9 +6,13 @@ any number of workers and after any resume.
 
 from __future__ import annotations
 
+import operator
 from enum import IntEnum
 
 import numpy as np
+
+from offbench.common.errors import OffbenchError
+from offbench.common.text import LARGEST
 
 
 class Purpose(IntEnum):
@@ -25,6 +29,21 @@ class Purpose(IntEnum):
     EVALUATION = 9  # the episodes of a run's evaluation at step i
     SAMPLE = 11  # which transitions or episodes a figure or a check uses
     BOOTSTRAP = 12  # the resampled seeds of a bootstrap interval
+
+
+def check_seed(seed: object) -> int:
+    """Return a user's seed as an int.
+
+    Raises:
+        OffbenchError: it is not a whole number from 0 to LARGEST.
+    """
+    try:
+        number = operator.index(seed)  # type: ignore[arg-type]
+    except TypeError:
+        number = -1
+    if not 0 <= number <= LARGEST:
+        raise OffbenchError(f"a seed is a whole number from 0 to 2**63 - 1, not {seed!r:.60}")
+    return number
 
 
 def sequence(seed: int, purpose: Purpose, *index: int) -> np.random.SeedSequence:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from offbench.common.errors import DamagedError, OffbenchError, unknown
+from offbench.common.text import LARGEST, whole_number
 
 T = TypeVar("T")
 Field: TypeAlias = dataclasses.Field[Any]
@@ -150,7 +151,7 @@ def _check_range(name: str, value: object, metadata: Mapping[str, Any], where: s
         raise _error(where, f"{name} must be one of {', '.join(choices)}, not {value!r}")
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
-    if isinstance(value, int) and abs(value) >= 2**63:
+    if isinstance(value, int) and abs(value) > LARGEST:
         raise _error(where, f"{name} is too large a number")
     low, above, high = metadata.get("low"), metadata.get("above"), metadata.get("high")
     if not math.isfinite(value):
@@ -209,13 +210,6 @@ def _convert_one(value: object, option: Any, parse: bool) -> Any:
     return value
 
 
-def _whole(text: str) -> int:
-    number = float(text)  # to accept 1e6
-    if not number.is_integer():
-        raise ValueError
-    return int(number)
-
-
 def _truth(text: str) -> bool:
     if text.lower() not in ("true", "false"):
         raise ValueError
@@ -228,7 +222,7 @@ def _none(text: str) -> None:
 
 
 _FROM_TEXT: dict[type, Callable[[str], object]] = {
-    int: _whole,
+    int: whole_number,
     float: float,
     bool: _truth,
     str: str,

@@ -5,6 +5,23 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 
+LARGEST = 2**63 - 1  # whole number that files hold
+
+
+def whole_number(text: str) -> int:
+    """Return the whole number that a text gives, in digits or as 1e6.
+
+    Raises:
+        ValueError: it gives none.
+    """
+    try:
+        return int(text)  # exact also beyond 2**53
+    except ValueError:
+        number = float(text)
+        if not number.is_integer():
+            raise
+        return int(number)
+
 
 def plural(number: int, noun: str) -> str:
     """Return `run` for 1, else `runs`."""

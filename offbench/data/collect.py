@@ -17,6 +17,7 @@ from offbench.common.files import JsonObject, sha256
 from offbench.common.processes import default_workers
 from offbench.common.progress import Progress
 from offbench.common.provenance import PHYSICS, versions
+from offbench.common.seeds import check_seed
 from offbench.common.terminal import inform
 from offbench.data import minari_store
 from offbench.data.behaviour_policy import BehaviourPolicy, level_name, read_behaviour_policy
@@ -80,7 +81,7 @@ def collect(
     Raises:
         OffbenchError: anything that the user can fix, in one line.
     """
-    recipe = load_recipe(env)
+    recipe, seed = load_recipe(env), check_seed(seed)
     given = None
     if policy is None:
         if name is not None:

@@ -13,7 +13,7 @@ from offbench.agents.ladder import shipped_references
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import default_workers
 from offbench.common.scores import interval, normalize
-from offbench.common.seeds import Purpose
+from offbench.common.seeds import Purpose, check_seed
 from offbench.common.text import counted
 from offbench.envs.environments import checked_spec, env_spec, same_environment
 from offbench.envs.margin_rule import ADDED, SINCE, without_margin
@@ -77,7 +77,7 @@ def evaluate(
     """
     if episodes < 1:
         raise OffbenchError(f"episodes must be at least 1, not {episodes}")
-    path = Path(path)
+    path, seed = Path(path), check_seed(seed)
     policy, config, spec = open_policy(path, env)
     if stochastic and not policy.stochastic:
         raise OffbenchError(f"{path} is a deterministic policy; leave out --stochastic")

@@ -17,7 +17,7 @@ import numpy as np
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import read_json, write_json
-from offbench.common.seeds import Purpose, generator
+from offbench.common.seeds import Purpose, check_seed, generator
 from offbench.common.settings import read_back
 from offbench.training.run import Run
 
@@ -65,7 +65,7 @@ def similarity(
 
     run = Run(Path(path))
     stack = restore(run, algorithm)
-    rng = generator(seed, Purpose.SAMPLE)
+    rng = generator(check_seed(seed), Purpose.SAMPLE)
     batch = stack.store.batch(torch.from_numpy(rng.integers(stack.store.sizes[0], size=(1, samples))))
     policy = stack.policy(0)
     dim, act = len(policy.observation_mean), len(policy.low)

@@ -22,7 +22,7 @@ from offbench.agents.ladder import BEHAVIOUR, find_ladder
 from offbench.common import seeds
 from offbench.common.errors import OffbenchError
 from offbench.common.files import disk_errors, output_file, write_bytes
-from offbench.common.seeds import Purpose
+from offbench.common.seeds import Purpose, check_seed
 from offbench.data.levels import parse_level
 from offbench.envs.environments import Env, make_env, spaces_of, time_limit
 from offbench.envs.recipes import load_recipe
@@ -69,7 +69,7 @@ def video(
     Raises:
         OffbenchError: no such policy or folder, an environment that cannot be rendered, no renderer, no mp4 encoder.
     """
-    target = output_file(out)
+    target, seed = output_file(out), check_seed(seed)
     if target.suffix.lower() not in ENDINGS:
         raise OffbenchError(f"a video's name must end in {' or '.join(ENDINGS)}, not {target.name!r}")
     if min(episodes, fps, size) < 1 or (seconds is not None and seconds <= 0):

@@ -5,15 +5,15 @@ specs -> group -> jobs -> what is left of them (pending) -> run_jobs, or a clust
 
 from __future__ import annotations
 
-import operator
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from offbench.algorithm.interface import Algorithm
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
+from offbench.common.seeds import check_seed
 from offbench.common.settings import build
 from offbench.data import transitions
 from offbench.envs.recipes import load_recipe
@@ -172,15 +172,12 @@ class Training:
 
 
 def _seed_list(seeds: int | Sequence[int]) -> tuple[int, ...]:
-    try:
-        return tuple(operator.index(seed) for seed in ([seeds] if isinstance(seeds, int) else seeds))
-    except TypeError:
-        raise OffbenchError(f"seeds must be whole numbers, not {seeds!r}") from None
+    return tuple(map(check_seed, seeds if isinstance(seeds, Iterable) else [seeds]))
 
 
 def _check_times(times: Times) -> None:
-    if not times.seeds or min(times.seeds) < 0 or len(set(times.seeds)) < len(times.seeds):
-        raise OffbenchError(f"seeds must be different whole numbers from 0, not {list(times.seeds)}")
+    if not times.seeds or len(set(times.seeds)) < len(times.seeds):
+        raise OffbenchError(f"seeds must be different whole numbers, not {list(times.seeds)}")
     for name in ("steps", "eval_every", "eval_episodes"):
         value = getattr(times, name)
         if not isinstance(value, int) or value < 1:
