@@ -99,7 +99,8 @@ TAILS: dict[str, list[tuple[int, str]]] = {
 def test_transitions_are_those_of_d4rls_loader(version: int, tail: str, home: Path, rng: np.random.Generator) -> None:
     file = d4rl_file(home / f"hopper_medium-v{version}.hdf5", LENGTHS + TAILS[tail], version, rng)
     import_d4rl(home / f"hopper_medium-v{version}.hdf5", "theirs-v0")
-    ours = np.load(export("theirs-v0", home / "out.npz", style="npz", drop_timeouts=True), allow_pickle=False)
+    with np.load(export("theirs-v0", home / "out.npz", style="npz", drop_timeouts=True), allow_pickle=False) as arrays:
+        ours = dict(arrays)
     theirs = qlearning(file)
     if TAILS[tail][-1][1] == "terminal":  # the very last row, which their loop never reaches: a termination is kept
         theirs = {
@@ -210,7 +211,8 @@ def test_a_dataset_comes_back_the_same(level: str, tiny: tuple[str, str], home: 
 
 def test_npz_holds_what_offbench_trains_on(medium: str, home: Path) -> None:
     main(["export", medium, "--out", "arrays.npz", "--format", "npz"])
-    arrays = np.load(home / "arrays.npz", allow_pickle=False)
+    with np.load(home / "arrays.npz", allow_pickle=False) as file:
+        arrays = dict(file)
     data = offbench.load(medium)
     np.testing.assert_array_equal(arrays["observations"], data.observations[data.rows])
     np.testing.assert_array_equal(arrays["next_observations"], data.observations[data.rows + 1])
