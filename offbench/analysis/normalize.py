@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import shlex
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -217,8 +219,14 @@ def notes(rows: Sequence[Row]) -> list[str]:
     if torn:
         lines.append(f"scores of {', '.join(torn)} are of evaluations at different steps and cannot be compared")
     if any("method" in row for row in rows):
-        methods = dict.fromkeys(Method(row["algorithm"], row["variant"], None, row["method"]) for row in rows)
-        lines += [f"settings of {text}" for text in unnamed_settings(methods)]
+        datasets: dict[Method, dict[str, None]] = {}
+        for row in rows:
+            method = Method(row["algorithm"], row["variant"], None, row["method"])
+            datasets.setdefault(method, {})[row["dataset"]] = None
+        variants = Counter(method.label for method in datasets)
+        for method, where in datasets.items():  # a method may have other settings on each dataset
+            name = method.label + (f" on {', '.join(where)}" if variants[method.label] > 1 else "")
+            lines += [f"settings of {text}" for text in unnamed_settings([replace(method, name=name)])]
     return lines
 
 

@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from scipy import stats
 
 import offbench
-from offbench.analysis.normalize import FORMATS, render
+from offbench.analysis.normalize import FORMATS, notes, render
 from offbench.cli.main import main
 from offbench.common.scores import interval, mean_std, normalize, run_return
 from offbench.envs.recipes import d4rl_reference
@@ -149,6 +149,23 @@ def test_a_picture_of_two_contents_has_two_panels(home: Path) -> None:
     svg = plot_curves("runs", home / "curves.svg").read_text()
     assert "x-v0 (12345678)" in svg
     assert "x-v0 (9abcdef0)" in svg
+
+
+def test_a_note_of_settings_names_the_dataset_where_they_differ() -> None:
+    rows = [
+        {"dataset": dataset, "algorithm": algorithm, "variant": variant, "method": algorithm}
+        for dataset, algorithm, variant in (
+            ("x-v0", "iql", "reward_scale=0.5"),
+            ("y-v0", "iql", "reward_scale=0.25"),
+            ("x-v0", "cql", "bc_steps=1"),
+            ("y-v0", "cql", "bc_steps=1"),
+        )
+    ]
+    assert notes(rows) == [
+        "settings of iql on x-v0: reward_scale=0.5",
+        "settings of iql on y-v0: reward_scale=0.25",
+        "settings of cql: bc_steps=1",
+    ]
 
 
 def test_runs_without_an_evaluation_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
