@@ -13,7 +13,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install -q -c constraints.txt -e ".[dev]"
 	@touch $@
 
-# A small hopper dataset, three algorithms on it for a short while, the score table, the curves as a picture.
+# A small halfcheetah dataset, three algorithms on it for a short while, the score table, the curves as a picture.
 demo: $(STAMP)
 	BIN=$(BIN) sh docs/demo.sh
 

@@ -1,7 +1,8 @@
 """The policy in a zip that Stable-Baselines3 saved: SAC, TD3, DDPG, PPO and A2C with MLP policies.
 
 Such a zip holds pickled data, which can run anything when it is loaded. Only two members are read here: policy.pth, by
-`torch.load(weights_only=True)`, which loads only tensors, and `data`, as JSON text, for the name of the activation.
+`torch.load(weights_only=True)`, which loads only tensors, and `data`, as JSON text, for the name of the activation and
+the bounds of the actions.
 """
 
 from __future__ import annotations
@@ -29,10 +30,11 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
     """Return the policy of an SB3 agent; nothing of the zip is unpickled.
 
     Args:
-        low, high: [act], the bounds of the environment's actions.
+        low, high: [act], the bounds of the environment's actions, for a zip that does not say its own.
 
     Raises:
-        OffbenchError: not such a zip, a damaged or malicious one, or a policy that is not an MLP's.
+        OffbenchError: not such a zip, a damaged or malicious one, a policy that is not an MLP's, or one for
+            observations that VecNormalize has normalized.
     """
     try:
         tensors, settings = _read(path)
@@ -49,6 +51,13 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
     activation = _activation(path, settings, default)
     if any(not np.isfinite(array).all() for pair in layers for array in pair):
         raise OffbenchError(f"{path} holds NaN or infinite weights")
+    if kind == "gaussian" and settings.get("_last_original_obs") is not None:  # SAC and TD3 always set it
+        raise OffbenchError(
+            f"{path} was trained with VecNormalize, whose statistics are not in the zip; "
+            "give --policy module:function, a function that normalizes observations and then acts"
+        )
+    actions = len(layers[-1][1]) // (1 if kind == "tanh" else 2)
+    low, high = _bounds(settings, "low", low, actions), _bounds(settings, "high", high, actions)
     zeros = np.zeros(layers[0][0].shape[0], np.float32)
     origin = {"algorithm": f"{algorithm} (Stable-Baselines3)"}
     return Policy(kind, layers, zeros, zeros + 1, low, high, env_id, origin, activation=activation)
@@ -84,6 +93,8 @@ def _layers(path: Path, tensors: Mapping[str, Array]) -> tuple[str, Layers, str,
             return "tanh", _sequence(tensors, "actor.mu"), "TD3 or DDPG", "relu"
         if "action_net.weight" in tensors:
             weight, bias = _layer(tensors, "action_net")
+            if "log_std" not in tensors:
+                raise OffbenchError(f"{path} has discrete actions; offbench records environments with continuous ones")
             std = tensors["log_std"]
             if std.shape != bias.shape:
                 raise KeyError("log_std")
@@ -115,6 +126,14 @@ def _sequence(tensors: Mapping[str, Array], name: str) -> Layers:
     """Return the linear layers of a torch.nn.Sequential, in order."""
     matches = (re.fullmatch(rf"{re.escape(name)}\.(\d+)\.weight", key) for key in tensors)
     return tuple(_layer(tensors, f"{name}.{index}") for index in sorted(int(match[1]) for match in matches if match))
+
+
+def _bounds(settings: JsonObject, name: str, default: Array, actions: int) -> Array:
+    """Return [actions], the lower or upper bounds of the agent's actions by the text that SB3 writes of its space."""
+    space = settings.get("action_space")
+    text = str(space.get(name, "")) if isinstance(space, dict) else ""
+    values = np.array([float(word) for word in re.findall(r"-?\d[\d.]*(?:e[+-]?\d+)?", text)], np.float32)
+    return values if len(values) == actions else np.resize(default, actions)
 
 
 def _activation(path: Path, settings: JsonObject, default: str) -> str:

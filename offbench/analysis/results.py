@@ -234,7 +234,10 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
     entries, waiting = entries_of(unique.values())
     if not entries:
         below = ", ".join(map(str, roots))
-        raise OffbenchError(f"no evaluated runs below {below}; start one with `offbench train ALGO --dataset ID`")
+        missing = "" if any(root.exists() for root in roots) else " (no such folder)"
+        raise OffbenchError(
+            f"no evaluated runs below {below}{missing}; start one with `offbench train ALGO --dataset ID`"
+        )
     for pattern in datasets:
         if not any(fnmatch(entry.task.dataset, pattern) for entry in entries):
             raise unknown("dataset", pattern, {entry.task.dataset for entry in entries})

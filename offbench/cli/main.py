@@ -150,7 +150,8 @@ def _main(words: list[str]) -> None:
         with _terminable(), _printable_output():
             _run(words)
     except KeyboardInterrupt as stop:
-        resume = "; rerun the same command to resume from the last checkpoint, if there is one"
+        without = " without --fresh" if "--fresh" in words else ""
+        resume = f"; rerun the same command{without} to resume from the last checkpoint, if there is one"
         print(file=sys.stderr)
         labeled("offbench", f"stopped{resume if _command(words) in RESUMED else ''}", "bold yellow")
         sys.exit(143 if isinstance(stop, Terminated) else 130)

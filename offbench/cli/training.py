@@ -55,7 +55,8 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         rest["algorithm"], settings = algorithm, named | settings
         if moved:
             note(f"{moved} is an option of bdb_plus, no longer of bdb: training bdb_plus")
-        folders = offbench.train(**rest, **settings, command=shlex.join(["offbench", "train", *words]))
+        kept = [word for word in words if word != "--fresh"]  # whoever repeats the command resumes
+        folders = offbench.train(**rest, **settings, command=shlex.join(["offbench", "train", *kept]))
         for folder in folders:
             print(folder)
         for text in notices(config, settings):

@@ -128,6 +128,13 @@ def _level(name: str) -> str:
 
 def _absent(dataset_id: str) -> OffbenchError:
     """Return the error for a dataset that is not here: how to record this very one, else the nearest that is here."""
+    if os.path.isfile(dataset_id):  # unlike Path.is_file, False for a name that no file can have
+        what = "a file, not a dataset's id; `offbench import-d4rl` converts D4RL's HDF5 files"
+        return OffbenchError(f"{dataset_id} is {what}")
+    if os.path.isfile(os.path.join(dataset_id, "data", "metadata.json")):
+        path = Path(dataset_id).absolute()
+        what = f"a folder, not a dataset's id; set MINARI_DATASETS_PATH={path.parent} and give {path.name}"
+        return OffbenchError(f"{dataset_id} is {what}")
     env, level = recorded_by(dataset_id)
     with contextlib.suppress(OffbenchError):  # no level
         name = f"{env}-{parse_level(level)[0]}-v{load_recipe(env).version}"

@@ -26,8 +26,8 @@ def inventory(what: str | None = None, *, runs: str | Path = "runs") -> JsonObje
     Args:
         what: `environments` (with their shipped ladders), `levels`, `algorithms`, `datasets` (local ones) or `runs`;
             None for all but the runs.
-        runs: the folder of the runs. A run's `step` is the newest that was evaluated, 0 if none was; `score` and
-            `d4rl_score` are those of `offbench.normalize`, None without such a reference.
+        runs: the folder of the runs. A run's `step` is the newest that was evaluated, or that of its newest checkpoint
+            if none was; `score` and `d4rl_score` are those of `offbench.normalize`, None without such a reference.
 
     Raises:
         OffbenchError: an unknown `what`, or the same run is there twice. Damaged runs are named on stderr and left
@@ -107,7 +107,7 @@ def _run(dataset: str, method: str, run: Run, config: RunConfig, trained: Traine
         "dataset": dataset,
         "method": method,
         "seed": config.seed,
-        "step": trained.reached if trained else 0,
+        "step": trained.reached if trained else run.newest_checkpoint(),
         "steps": config.steps,
         "state": trained.state if trained else "diverged" if run.diverged else "unfinished",
         "return": trained.score(None) if trained else None,

@@ -63,13 +63,19 @@ def raise_first(problems: Sequence[str]) -> None:
         raise OffbenchError(problems[0] + more)
 
 
+def _first_run(job: Job) -> str:
+    """Return what tells a job from others of the same title."""
+    variant = "" if job.first.variant == "default" else f", {job.first.variant}"
+    return f"{variant}, seed {job.first.seed}"
+
+
 class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
     """Adds up the jobs' steps for one progress bar."""
 
     def __init__(self, jobs: Sequence[Job]) -> None:
         self.jobs, self.steps, self.notes = jobs, dict[int, int](), dict[int, str]()
         titles = collections.Counter(job.title for job in jobs)
-        self.titles = [job.title + (f", seed {job.first.seed}" if titles[job.title] > 1 else "") for job in jobs]
+        self.titles = [job.title + (_first_run(job) if titles[job.title] > 1 else "") for job in jobs]
         runs = sum(len(job.specs) for job in jobs)
         title = jobs[0].title if len(jobs) == 1 else f"{runs} runs"
         self.progress = Progress(sum(job.updates for job in jobs), title, work=sum(job.work for job in jobs))

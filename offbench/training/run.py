@@ -42,6 +42,7 @@ from offbench.training.source_code import changes
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 FORMAT = "offbench-run-1"
 REPEAT = "delete the run to repeat it"
+OTHER = "delete that run (`train` does with --fresh) or give another --runs"
 DIGITS = 8  # of a content hash, where a table must tell two contents of one dataset id apart
 LARGEST = 1e15  # what no step, return or reference reaches: scores and their squares stay finite
 SMALLEST_GAP = 1e-12  # between the references of a score
@@ -186,16 +187,13 @@ class Run:
                 if key == "dataset_sha256":
                     raise OffbenchError(
                         f"{self.folder} was trained on another content of {config.dataset}, which has been recorded "
-                        "again since; delete that run or give another --runs"
+                        f"again since; {OTHER}"
                     )
                 flag = f"--{key.replace('_', '-')}" if key.startswith("eval") else key
-                raise OffbenchError(
-                    f"{self.folder} was started with {flag} {old}, not {new}; delete it or give another --runs"
-                )
+                raise OffbenchError(f"{self.folder} was started with {flag} {old}, not {new}; {OTHER}")
             if changed := changes(existing.code, config.code):
                 raise OffbenchError(
-                    f"{self.folder} was trained by other code of {config.algorithm}: {changed}; "
-                    "give --fresh to train it again, or another --runs"
+                    f"{self.folder} was trained by other code of {config.algorithm}: {changed}; {OTHER}"
                 )
         elif any(self.folder.glob("checkpoint-*.safetensors")):
             raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
@@ -240,6 +238,12 @@ class Run:
     def diverged(self) -> bool:
         """Whether the run is marked as diverged; it is not trained any further until diverged.json is deleted."""
         return (self.folder / "diverged.json").exists()
+
+    def newest_checkpoint(self) -> int:
+        """Return the step of the newest checkpoint, 0 if there is none."""
+        from offbench.common import checkpoints  # imports PyTorch, which `normalize` does without
+
+        return max(checkpoints.steps(self.folder), default=0)
 
     def finished(self, steps: int) -> bool:
         """Return whether the run is done: checkpoint and evaluation of step `steps`, and a policy."""

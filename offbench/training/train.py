@@ -21,7 +21,7 @@ from offbench.training.devices import Machine, pick_machine
 from offbench.training.grouping import check_datasets, group, load_datasets, pending
 from offbench.training.jobs import raise_first, run_jobs
 from offbench.training.loggers import NOWHERE, Destinations
-from offbench.training.registry import current_settings, is_local, load_algorithm, use
+from offbench.training.registry import algorithm_names, current_settings, is_local, load_algorithm, use
 from offbench.training.run import Run
 from offbench.training.source_code import changes, code_of
 from offbench.training.spec import Job, RunSpec, Times, specs_of
@@ -196,7 +196,12 @@ def restore(run: Run, algorithm: str | type | None = None) -> Stack:
     config = run.config()
     if algorithm is not None and use(algorithm) != config.algorithm:
         raise OffbenchError(f"{run.folder} is a run of {config.algorithm}, not of {use(algorithm)}")
-    kind = load_algorithm(config.algorithm)
+    try:
+        kind = load_algorithm(config.algorithm)
+    except OffbenchError as error:
+        if config.algorithm in algorithm_names():
+            raise
+        raise OffbenchError(f"{error}; for a file of your own, give --algorithm ./FILE.py:CLASS") from None
     recorded = current_settings(config.algorithm, config.settings, str(run.folder))
     if changed := changes(config.code, code_of(config.algorithm)):
         raise OffbenchError(f"{run.folder} was trained by other code of {config.algorithm}: {changed}")

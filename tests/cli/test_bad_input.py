@@ -122,6 +122,8 @@ CASES: dict[str, tuple[str, str]] = {
     "show MEDIM": ("did you mean 'tiny-medium-v0'? Or record one: `offbench collect", ""),
     "show MEDIUM --plot out.gif": ("a figure's name must end in .png, .svg, .pdf, not 'out.gif'", ""),
     "verify": ("the following arguments are required: ID", ""),
+    "train bc --dataset empty.safetensors": ("empty.safetensors is a file, not a dataset's id", "import-d4rl"),
+    "verify FOLDER": ("is a folder, not a dataset's id", "and give tiny-medium-v0"),
     "verify x-v0": ("unknown dataset 'x-v0'", "offbench collect"),
     "verify MEDIM": ("did you mean 'tiny-medium-v0'?", ""),
     "verify ../MEDIUM": ("unknown dataset '../MEDIUM'", ""),
@@ -184,6 +186,7 @@ def prepared(medium: str, home: Path) -> dict[str, str]:
     return {
         "D4RL": "file.hdf5",
         "MEDIUM": medium,
+        "FOLDER": f"minari/{medium}",
         "DISCRETE": "discrete-v0",
         "NAN": "nan-v0",
         "MEDIM": "tiny-medum-v0",

@@ -80,7 +80,7 @@ def test_a_message_breaks_between_words_and_not_within_a_command(screen: Callabl
     assert max(map(len, lines)) <= columns
     command = "`offbench train ALGO --dataset ID`"
     assert any(command in line for line in lines)
-    message = f"offbench: no evaluated runs below a-folder-without-runs; start one with {command}"
+    message = f"offbench: no evaluated runs below a-folder-without-runs (no such folder); start one with {command}"
     assert " ".join(lines) == message
     assert len(message) > columns
 

@@ -12,6 +12,7 @@ import pytest
 
 from offbench.common import progress
 from offbench.training.jobs import JobProgress
+from offbench.training.registry import load_algorithm
 from offbench.training.spec import Job, RunSpec
 
 
@@ -32,7 +33,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def job(algorithm: str, runs: int, steps: int, cost: float) -> Job:
-    specs = tuple(RunSpec(algorithm, None, "x-v0", seed, steps, 100, 1, Path()) for seed in range(runs))
+    config = load_algorithm(algorithm).Config()
+    specs = tuple(RunSpec(algorithm, config, "x-v0", seed, steps, 100, 1, Path()) for seed in range(runs))
     return Job(specs, "cpu", cost=cost)
 
 
@@ -59,14 +61,15 @@ def test_trainings_side_by_side_have_a_line_for_every_evaluation(
     clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:
     jobs = [job("bc", 1, 1000, 1.0), job("bc", 1, 1000, 1.0), job("td3_bc", 1, 1000, 1.0)]
-    jobs[1] = Job((dataclasses.replace(jobs[1].first, seed=7),), "cpu")
+    wide = dataclasses.replace(jobs[1].first.config, hidden=(8, 8))
+    jobs[1] = Job((dataclasses.replace(jobs[1].first, seed=7, config=wide),), "cpu")
     with JobProgress(jobs) as bar:
         for step in range(10, 301, 10):
             for index in range(3):
                 clock.now += 0.01
                 bar.report(index, step, f"score {index} at step {step // 100 * 100}" if step >= 100 else "")
     notes = [line.rpartition("left, ")[2] for line in capsys.readouterr().err.splitlines() if "score" in line]
-    titles = ["bc on x-v0, seed 0", "bc on x-v0, seed 7", "td3_bc on x-v0"]
+    titles = ["bc on x-v0, seed 0", "bc on x-v0, hidden=8x8, seed 7", "td3_bc on x-v0"]
     assert notes == [f"{titles[i]}: score {i} at step {step}" for step in (100, 200, 300) for i in range(3)]
 
 

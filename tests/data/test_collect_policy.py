@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import offbench
 from offbench.agents.sb3_zip import read_sb3_zip
@@ -75,6 +76,26 @@ def test_a_hostile_zip_is_refused(home: Path, tiny: tuple[str, str]) -> None:
         with pytest.raises(OffbenchError, match=r"evil\.zip is (refused|not a readable zip)"):
             offbench.collect(tiny[0], policy="evil.zip", behaviour_dir=tiny[1])
     assert not (home / "PWNED").exists()
+    assert minari_store.local_ids() == []
+
+
+def test_an_agent_of_another_environment_is_refused(home: Path, tiny: tuple[str, str]) -> None:
+    other = gym.make("Hopper-v5")
+    narrow = gym.wrappers.RescaleAction(gym.make(ENV), np.float32(-0.5), np.float32(0.5))
+    normalized = VecNormalize(DummyVecEnv([lambda: gym.make(ENV)]))
+    normalized_agent = PPO("MlpPolicy", normalized, n_steps=8, batch_size=8, device="cpu").learn(8)
+    agents = {
+        r"takes observations \(11,\) and gives actions \(3,\), but InvertedPendulum-v5 has": PPO("MlpPolicy", other),
+        r"acts in \[-0\.5\] to \[0\.5\], but InvertedPendulum-v5 in \[-3\.\] to \[3\.\]": SAC(
+            "MlpPolicy", narrow, buffer_size=9
+        ),
+        "has discrete actions": PPO("MlpPolicy", "CartPole-v1"),
+        "was trained with VecNormalize": normalized_agent,
+    }
+    for message, agent in agents.items():
+        agent.save(home / "agent.zip")
+        with pytest.raises(OffbenchError, match=f"agent.zip {message}"):
+            offbench.collect(tiny[0], policy="agent.zip", behaviour_dir=tiny[1])
     assert minari_store.local_ids() == []
 
 

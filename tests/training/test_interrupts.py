@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -86,9 +88,28 @@ def test_ctrl_c_and_sigterm_save_a_checkpoint_where_they_arrive(
     assert sorted(run.evaluations()) == [200]
     assert "stopped at step 300, checkpoint saved" in (said := capsys.readouterr().err)
     assert "rerun the same command to resume" in said
+    assert run.config().command == shlex.join(["offbench", *words])
     main(words)
     assert "resuming from step 300" in capsys.readouterr().err
     assert_same_files(run, whole)
+
+
+@pytest.mark.usefixtures("ctrl_c")
+def test_ctrl_c_after_fresh_says_how_to_keep_the_checkpoint(
+    medium: str, home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", "bc", "--dataset", medium, "--steps", "600", "--eval-every", "600", "--eval-episodes", "2"]
+    words += ["--workers", "1", "--hidden", "8", "--batch-size", "32"]
+    with monkeypatch.context() as patched:
+        patched.setattr(Stack, "train", interrupted(signal.SIGINT))
+        with pytest.raises(SystemExit):
+            main([*words, "--fresh"])
+    assert "rerun the same command without --fresh to resume" in " ".join(capsys.readouterr().err.split())
+    (path,) = home.rglob("config.json")
+    assert Run(path.parent).config().command == shlex.join(["offbench", *words])
+    main(["list", "runs", "--json"])
+    (row,) = json.loads(capsys.readouterr().out)["runs"]
+    assert row["step"] == 300  # although nothing was evaluated yet
 
 
 @pytest.mark.usefixtures("ctrl_c")

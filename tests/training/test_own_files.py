@@ -61,6 +61,11 @@ def test_a_file_trains_resumes_and_reports(home: Path, capsys: pytest.CaptureFix
     assert whole.policy_path.read_bytes() == pieces.policy_path.read_bytes()
     assert whole.losses_path.read_bytes() == pieces.losses_path.read_bytes()
     assert pieces.folder == Path("runs") / DATA / "AWAC" / "batch_size=16,hidden=8x8" / "seed-0"
+    again(home)
+    del os.environ[registry.OWN]
+    said = refusal(["evaluate", str(pieces.folder), "--similarity"], capsys)
+    assert "unknown algorithm 'AWAC'" in said
+    assert "for a file of your own, give --algorithm ./FILE.py:CLASS" in said
     main(["evaluate", str(pieces.folder), "--similarity", "--algorithm", "awac.py"])
     assert (pieces.folder / "similarity.json").exists()
     with pytest.raises(OffbenchError, match="is a run of AWAC, not of bdb"):
@@ -162,8 +167,9 @@ def test_an_edit_is_noticed_and_a_comment_is_none(home: Path, capsys: pytest.Cap
     file.write_text(EXAMPLE.replace("max=100", "max=0.5"))
     before = run.policy_path.read_bytes()
     for steps in ("20", "30"):  # a finished run, and one to resume
-        assert "was trained by other code of AWAC: awac.py has changed; give --fresh" in refusal(
-            [*train, steps], capsys
+        assert (
+            "was trained by other code of AWAC: awac.py has changed; delete that run (`train` does with --fresh)"
+            in refusal([*train, steps], capsys)
         )
     assert run.policy_path.read_bytes() == before
     main([*train, "20", "--fresh"])
