@@ -132,7 +132,9 @@ def _bounds(settings: JsonObject, name: str, default: Array, actions: int) -> Ar
     """Return [actions], the lower or upper bounds of the agent's actions by the text that SB3 writes of its space."""
     space = settings.get("action_space")
     text = str(space.get(name, "")) if isinstance(space, dict) else ""
-    values = np.array([float(word) for word in re.findall(r"-?\d[\d.]*(?:e[+-]?\d+)?", text)], np.float32)
+    numbers = re.findall(r"-?\d+(?:\.\d*)?(?:e[+-]?\d+)?", text)
+    with np.errstate(over="ignore"):
+        values = np.array([float(number) for number in numbers]).astype(np.float32)
     return values if len(values) == actions else np.resize(default, actions)
 
 

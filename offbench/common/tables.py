@@ -1,4 +1,4 @@
-"""A table that is written once and printed as CSV, Markdown, LaTeX and HTML."""
+"""A table that is written once and printed as CSV, Markdown and LaTeX; reports.page prints it as HTML."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import pickle
 import zipfile
@@ -61,6 +62,20 @@ class Touch:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return os.system, ("touch PWNED",)
+
+
+@pytest.mark.parametrize("text", ["[1.2.3e]", "[-1e999]", "[1e300]", "[]", "1 2 3", None, [3]])
+def test_any_text_of_the_bounds_is_read_or_ignored(text: object, home: Path) -> None:
+    _, path = saved("td3", home)
+    with zipfile.ZipFile(path) as archive:
+        weights, data = archive.read("policy.pth"), json.loads(archive.read("data"))
+    data["action_space"]["low"] = text
+    with zipfile.ZipFile(home / "odd.zip", "w") as archive:
+        archive.writestr("policy.pth", weights)
+        archive.writestr("data", json.dumps(data))
+    policy = read_sb3_zip(home / "odd.zip", LOW, HIGH, ENV)
+    assert len(policy.low) == 1
+    assert policy.high == HIGH
 
 
 def test_a_hostile_zip_is_refused(home: Path, tiny: tuple[str, str]) -> None:
