@@ -63,10 +63,17 @@ def raise_first(problems: Sequence[str]) -> None:
         raise OffbenchError(problems[0] + more)
 
 
-def _first_run(job: Job) -> str:
-    """Return what tells a job from others of the same title."""
-    variant = "" if job.first.variant == "default" else f", {job.first.variant}"
-    return f"{variant}, seed {job.first.seed}"
+def _titles(jobs: Sequence[Job]) -> list[str]:
+    """Return a title for each job: settings and seed of its first run are added where they tell jobs apart."""
+    variants: dict[str, list[str]] = {}
+    for job in jobs:
+        variants.setdefault(job.title, []).append(job.first.variant)
+    titles = []
+    for job in jobs:
+        alike = variants[job.title]
+        variant = f", {job.first.variant}" if len(set(alike)) > 1 else ""
+        titles.append(job.title + (f"{variant}, seed {job.first.seed}" if len(alike) > 1 else ""))
+    return titles
 
 
 class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
@@ -74,8 +81,7 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
 
     def __init__(self, jobs: Sequence[Job]) -> None:
         self.jobs, self.steps, self.notes = jobs, dict[int, int](), dict[int, str]()
-        titles = collections.Counter(job.title for job in jobs)
-        self.titles = [job.title + (_first_run(job) if titles[job.title] > 1 else "") for job in jobs]
+        self.titles = _titles(jobs)
         runs = sum(len(job.specs) for job in jobs)
         title = jobs[0].title if len(jobs) == 1 else f"{runs} runs"
         self.progress = Progress(sum(job.updates for job in jobs), title, work=sum(job.work for job in jobs))

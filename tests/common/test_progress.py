@@ -69,7 +69,7 @@ def test_trainings_side_by_side_have_a_line_for_every_evaluation(
                 clock.now += 0.01
                 bar.report(index, step, f"score {index} at step {step // 100 * 100}" if step >= 100 else "")
     notes = [line.rpartition("left, ")[2] for line in capsys.readouterr().err.splitlines() if "score" in line]
-    titles = ["bc on x-v0, seed 0", "bc on x-v0, hidden=8x8, seed 7", "td3_bc on x-v0"]
+    titles = ["bc on x-v0, default, seed 0", "bc on x-v0, hidden=8x8, seed 7", "td3_bc on x-v0"]
     assert notes == [f"{titles[i]}: score {i} at step {step}" for step in (100, 200, 300) for i in range(3)]
 
 
