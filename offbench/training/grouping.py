@@ -30,7 +30,7 @@ from offbench.envs.version_warning import warn_other_physics
 from offbench.training.captured_update import WARM_UP
 from offbench.training.devices import Machine
 from offbench.training.registry import load_algorithm
-from offbench.training.run import OTHER, RunConfig
+from offbench.training.run import TRAIN_ANEW, RunConfig
 from offbench.training.source_code import code_of
 from offbench.training.spec import Job, RunSpec, settings_json
 from offbench.training.stack import Stack
@@ -181,7 +181,7 @@ def _check_environment(spec: RunSpec, data: Transitions) -> None:
     if before is not None and data.env_spec is not None and not same_environment(before, data.env_spec):
         raise OffbenchError(
             f"{spec.folder} was evaluated in another environment than {spec.dataset} names now "
-            f"({before}, not {data.env_spec}); {OTHER}"
+            f"({before}, not {data.env_spec}); {TRAIN_ANEW}"
         )
 
 

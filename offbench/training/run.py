@@ -42,7 +42,7 @@ from offbench.training.source_code import changes
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 FORMAT = "offbench-run-1"
 REPEAT = "delete the run to repeat it"
-OTHER = "delete that run (`train` does with --fresh) or give another --runs"
+TRAIN_ANEW = "delete that run (`train` does with --fresh) or give another --runs"
 DIGITS = 8  # of a content hash, where a table must tell two contents of one dataset id apart
 LARGEST = 1e15  # what no step, return or reference reaches: scores and their squares stay finite
 SMALLEST_GAP = 1e-12  # between the references of a score
@@ -187,13 +187,13 @@ class Run:
                 if key == "dataset_sha256":
                     raise OffbenchError(
                         f"{self.folder} was trained on another content of {config.dataset}, which has been recorded "
-                        f"again since; {OTHER}"
+                        f"again since; {TRAIN_ANEW}"
                     )
                 flag = f"--{key.replace('_', '-')}" if key.startswith("eval") else key
-                raise OffbenchError(f"{self.folder} was started with {flag} {old}, not {new}; {OTHER}")
+                raise OffbenchError(f"{self.folder} was started with {flag} {old}, not {new}; {TRAIN_ANEW}")
             if changed := changes(existing.code, config.code):
                 raise OffbenchError(
-                    f"{self.folder} was trained by other code of {config.algorithm}: {changed}; {OTHER}"
+                    f"{self.folder} was trained by other code of {config.algorithm}: {changed}; {TRAIN_ANEW}"
                 )
         elif any(self.folder.glob("checkpoint-*.safetensors")):
             raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
