@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import shutil
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -18,7 +19,7 @@ from filelock import FileLock, Timeout
 
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
-from offbench.common.files import JsonObject, damage, disk_errors, exclusive_lock, read_json
+from offbench.common.files import ORPHANS, JsonObject, damage, disk_errors, exclusive_lock, read_json
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.settings import read_back, setting
 from offbench.data.levels import parse_level
@@ -102,7 +103,9 @@ def local_ids(unreadable: Callable[[OSError], None] | None = None) -> list[str]:
         if os.path.isfile(os.path.join(folder, "data", "metadata.json")):
             ids.append(os.path.relpath(folder, base))
             folders.clear()
+        replaced = {match[1] for name in folders if (match := OLD.fullmatch(name))} - set(folders)
         folders[:] = [name for name in folders if not name.startswith(".")]
+        folders += [name for name in replaced if _put_back(Path(folder, name))]
     return sorted(ids)
 
 
@@ -203,7 +206,7 @@ def exists(dataset_id: str) -> bool:
     inside = not dataset_id.startswith((".", "/")) and ".." not in Path(dataset_id).parts and "\0" not in dataset_id
     path = root() / dataset_id / "data" / "metadata.json"
     with damage(str(path), "cannot be looked up", "check the id and the disk"):
-        return inside and path.exists()
+        return inside and (path.exists() or (_put_back(root() / dataset_id) and path.exists()))
 
 
 def provenance(metadata: JsonObject) -> Provenance:
@@ -253,6 +256,16 @@ def _beside(path: Path, ending: str) -> Path:
     return path.with_name(f".offbench-{path.name}.{ending}")
 
 
+OLD = re.compile(r"\.offbench-(.+)\.old")  # of `_beside`
+
+
+def _put_back(path: Path) -> bool:
+    """Put back a dataset whose writer was killed between the two renames of `write`; return whether it is there."""
+    if os.path.lexists(_beside(path, "old")):
+        _tidy(path, ORPHANS)
+    return path.exists()
+
+
 @contextlib.contextmanager
 def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     """Hold a dataset id for writing; yields its folder.
@@ -283,10 +296,13 @@ def _size(dataset_id: str) -> str:
 
 def tidy(dataset_id: str) -> None:
     """Delete what a killed process left beside a dataset, unless one is at work on it or the folder is read-only."""
-    path = path_of(dataset_id)
+    _tidy(path_of(dataset_id), 0)
+
+
+def _tidy(path: Path, timeout: float) -> None:
     with (
         contextlib.suppress(OffbenchError),
-        exclusive_lock(_beside(path, "lock"), dataset_id, timeout=0),
+        exclusive_lock(_beside(path, "lock"), path.name, timeout),
         disk_errors(str(path)),
     ):
         _recover(path)

@@ -171,6 +171,36 @@ def test_collect_survives_kill_9(
     trials(warm, again if kind == "overwrite" else words, kind, home, monkeypatch, prepare, look, record_property)
 
 
+KILLED_BETWEEN = """
+import os, signal, sys
+from pathlib import Path
+from offbench.cli.main import main
+
+replace = Path.replace
+def kill_at_the_second(path, target):
+    if path.name.endswith(".partial"):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return replace(path, target)
+Path.replace = kill_at_the_second
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize(
+    "look", [minari_store.exists, lambda name: name in minari_store.local_ids()], ids=["id", "list"]
+)
+def test_killed_between_the_two_renames(look: Callable[[str], bool], medium: str, tiny: tuple[str, str]) -> None:
+    """The old dataset is renamed already, the new one not yet: the next look puts the old one back."""
+    old = whole(medium)
+    words = ["collect", tiny[0], "--behaviour-dir", tiny[1], "--workers", "1", "--steps", "600", "--overwrite"]
+    killed = subprocess.run([sys.executable, "-c", KILLED_BETWEEN, *words], capture_output=True, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert not minari_store.path_of(medium).exists()
+    assert look(medium)
+    assert whole(medium) == old
+    assert [p.name for p in minari_store.root().iterdir() if not p.name.endswith(".lock")] == [medium]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS["import"]))
 def test_import_survives_kill_9(
