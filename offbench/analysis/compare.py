@@ -72,16 +72,27 @@ class Comparison:
             return f"no evidence of a difference at {over}"
         return f"{self.a if sign > 0 else self.b} is better: +{estimate if sign > 0 else -estimate} at {over}"
 
+    @property
+    def title(self) -> str:
+        """Who is compared with whom, and what the scores are normalized by."""
+        return f"{self.a} against {self.b} ({self.reference})"
+
+    def table(self) -> tuple[list[str], list[list[str]]]:
+        """Return the header and the rows of a table of the pairs."""
+        header = ["dataset", "seed", self.a, self.b, "difference"]
+        return header, [[p.dataset, str(p.seed), f"{p.a:.1f}", f"{p.b:.1f}", f"{p.a - p.b:+.1f}"] for p in self.pairs]
+
     def lines(self) -> list[str]:
         """Return the comparison as text."""
+        return [self.title, "", *aligned(*self.table()), "", *self.conclusion()]
+
+    def conclusion(self) -> list[str]:
+        """Return statistics, notes and verdict as text."""
         statistics = self.statistics
         effect = "-" if statistics.standardized is None else f"{statistics.standardized:+.2f}"
         pairs = counted(statistics.pairs, "paired difference")
         percent = self.chance.percent()
-        lines = [f"{self.a} against {self.b} ({self.reference})", ""]
-        lines += [
-            *self._pair_lines(),
-            "",
+        lines = [
             f"mean difference             {statistics.difference.value:+.1f} {statistics.difference.span()}".rstrip(),
             f"standardized                {effect} (over the deviation of {pairs})",
             f"probability of improvement  {percent.value:.0f}% {percent.span()}".rstrip(),
@@ -101,13 +112,6 @@ class Comparison:
                 f"and {verbs[1]} left out"
             )
         return [*lines, "", self.verdict]
-
-    def _pair_lines(self) -> list[str]:
-        """Return the scores of each pair below a header that says whose they are."""
-        header = ["dataset", "seed", self.a, self.b, "difference"]
-        rows = [[p.dataset, str(p.seed), f"{p.a:.1f}", f"{p.b:.1f}", f"{p.a - p.b:+.1f}"] for p in self.pairs]
-        head, _, *lines = aligned(header, rows)
-        return [head, *lines]
 
     def row(self) -> JsonObject:
         """Return the comparison as a JSON object."""

@@ -90,7 +90,9 @@ def compare_arguments(parser: Parser, _: list[str]) -> None:
         if json:
             print(dumps(comparison.row(), indent=1))
         else:
-            print_lines(comparison.lines())
+            print_lines([comparison.title, ""])
+            print_table(*comparison.table())
+            print_lines(["", *comparison.conclusion()])
 
     parser.set_defaults(run=run)
 

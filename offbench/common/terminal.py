@@ -11,7 +11,7 @@ import re
 import shlex
 import sys
 import textwrap
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, TextIO
 
 from offbench.common.text import aligned, printable
@@ -123,7 +123,7 @@ def print_table(
     """Print a table to stdout.
 
     In a pipe it is aligned text, one line a row and nothing left out. On a terminal it is as wide as the terminal:
-    long names wrap.
+    long names and headers wrap.
 
     Args:
         names: how many leading columns are text; the others are aligned to the right.
@@ -142,16 +142,18 @@ def print_table(
     def missing() -> int:
         return sum(widths[column] + 2 for column in shown) - 2 + indent - int(screen.width)
 
-    def narrow(least: int) -> None:
-        texts = [column for column in shown if column < names]
-        while missing() > 0 and max(widths[column] for column in texts) > least:  # the widest name shrinks first
-            widths[max(texts, key=widths.__getitem__)] -= 1
+    def narrow(least: Mapping[int, int]) -> None:
+        """Take width from the columns in `least` that are wider than it says, from the widest first."""
+        while missing() > 0 and (wide := [c for c in shown if c in least and widths[c] > least[c]]):
+            widths[max(wide, key=widths.__getitem__)] -= 1
 
-    narrow(NARROW)
+    texts, numbers = range(names), range(names, len(header))
+    narrow(dict.fromkeys(texts, NARROW))
     for title in optional:
         if missing() > 0:
             shown = [column for column in shown if header[column] != title]
-    narrow(NARROWEST)
+    narrow({c: max(map(len, [*header[c].split(), *(row[c] for row in rows)]), default=0) for c in numbers})
+    narrow(dict.fromkeys(texts, NARROWEST))
     layout = [(column, widths[column], column < names) for column in shown]
     for line in _lines(header, layout):
         screen.print(_indented(line, indent), style="bold", soft_wrap=True)

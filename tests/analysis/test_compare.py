@@ -66,8 +66,9 @@ def test_the_scores_stand_below_whose_they_are(home: Path) -> None:
     scores(home / "runs", "td3_bc", [51.0, 152.0, 7.0])
     scores(home / "runs", "bdb", [50.0, 50.0], variant="beta=0.5")
     lines = offbench.compare("td3_bc", "bdb/beta=0.5").lines()
-    assert lines[2:5] == [
+    assert lines[2:6] == [
         "dataset           seed  td3_bc  bdb (beta=0.5)  difference",
+        "----------------  ----  ------  --------------  ----------",
         "hopper-medium-v0     0    51.0            50.0        +1.0",
         "hopper-medium-v0     1   152.0            50.0      +102.0",
     ]

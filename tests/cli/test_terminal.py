@@ -63,6 +63,17 @@ def test_the_score_table_fits(screen: Callable[..., str], home: Path, columns: i
     assert ("evals" in plain) == (columns > 60)  # what gives way first
 
 
+def test_the_table_of_a_comparison_fits(screen: Callable[..., str], home: Path) -> None:
+    for variant in ("lagrange_target=10.0", "lagrange_target=5.0"):
+        for seed in range(2):
+            made_run(home / "runs", "halfcheetah-medium-expert-v0", "cql", variant, seed, 20)
+    plain = COLOR.sub("", screen(80, "compare", "cql (lagrange_target=10.0)", "cql (lagrange_target=5.0)"))
+    assert max(map(len, plain.splitlines())) <= 80
+    assert re.search(
+        r"^dataset +seed +cql +cql +difference\n +\(lagrange_target=10\.0\) +\(lagrange_target=5\.0\)$", plain, re.M
+    )
+
+
 def test_the_table_of_runs_fits(screen: Callable[..., str], home: Path) -> None:
     made_grid(home / "runs", envs=("halfcheetah",), seeds=2, levels=4)
     plain = COLOR.sub("", screen(80, "list", "runs"))
