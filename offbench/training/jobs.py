@@ -19,6 +19,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.interrupts import announce_stop
 from offbench.common.processes import quiet_start, start_worker
 from offbench.common.progress import Progress
+from offbench.common.text import printable
 from offbench.training.devices import arithmetic
 from offbench.training.grouping import load_datasets
 from offbench.training.registry import failure
@@ -169,6 +170,7 @@ class _Pool(contextlib.AbstractContextManager["_Pool"]):
 
 def _train_in_processes(jobs: Sequence[Job], processes: int, pool: _Pool) -> Iterator[str]:
     waiting = collections.deque(enumerate(jobs))
+    traces = {""}
     while waiting or pool.active:
         while waiting and len(pool.active) < processes:
             index, job = waiting.popleft()
@@ -186,17 +188,21 @@ def _train_in_processes(jobs: Sequence[Job], processes: int, pool: _Pool) -> Ite
             if step is not None:
                 pool.progress.report(index, step, note)
                 continue
+            if note not in traces:  # all jobs may fail at the same line
+                pool.progress.progress.say(printable(note.rstrip()))
+                traces.add(note)
             yield from lines
             pool.end(receiver)
 
 
 def _worker(job: Job, sender: Connection, parent: int) -> None:
-    """Train in a process: send (step, note, None) for each report, then (None, "", problems)."""
+    """Train in a process: send (step, note, None) for each report, then (None, traceback or "", problems)."""
     start_worker(parent)
+    traces: list[str] = []
     try:
         lines = train_job(job, lambda step, note: sender.send((step, note, None)))
     except OffbenchError as error:
         lines = [str(error)]
     except Exception as error:
-        lines = [f"{job.title}: {failure(error)}"]
-    sender.send((None, "", lines))
+        lines = [f"{job.title}: {failure(error, traces.append)}"]
+    sender.send((None, "".join(traces), lines))

@@ -17,6 +17,7 @@ import re
 import sys
 import traceback
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,16 +71,17 @@ def algorithm_names() -> list[str]:
     return sorted(_entry_points())
 
 
-def failure(error: Exception) -> str:
+def failure(error: Exception, show: Callable[[str], object] | None = None) -> str:
     """Return what has gone wrong and what to do about it, whatever was raised.
 
-    The traceback goes to stderr if $OFFBENCH_TRACEBACK is set, or if an installed algorithm has the fault: whoever
-    writes one needs it.
+    Args:
+        show: receives the traceback (None: it goes to stderr) if $OFFBENCH_TRACEBACK is set, or if an installed
+            algorithm has the fault: whoever writes one needs it.
     """
     expected = isinstance(error, OffbenchError | OSError) or is_out_of_memory(error)
     algorithm = None if expected else _third_party(error.__traceback__)
     if algorithm or os.environ.get("OFFBENCH_TRACEBACK"):
-        traceback.print_exception(error)
+        (show or sys.stderr.write)("".join(traceback.format_exception(error)))
     if isinstance(error, OffbenchError):
         return str(error)
     if is_out_of_memory(error):
