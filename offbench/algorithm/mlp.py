@@ -13,31 +13,28 @@ layer have a last column of ones:
     [h | 1] [batch, in + 1]  @  [W; b] [in + 1, out]          one product gives h W + b,
     [h | 1].T @ gradient                                      and one the gradients of W and b
 
-In bfloat16 the wide products (`_Half`) read copies of their factors in bfloat16; everything else stays in float32.
+In bfloat16 the wide layers (`Bfloat16Layer`) round their factors and products; everything else stays in float32.
 """
 
 from __future__ import annotations
 
 import itertools
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from offbench.algorithm.bfloat16_layer import Bfloat16Layer
+from offbench.algorithm.buffers import Array, rows, rows_with_ones, shared
 from offbench.algorithm.cpu_capture import Call, one_call
 from offbench.algorithm.stacked import layers_of, one_by_one, stacked
 
 _WAY = ContextVar("way", default="numpy")
-Array = npt.NDArray[np.float32]
-Buffer = TypeVar("Buffer", Array, Tensor)
-ALIGNED = 16  # float32 numbers of 64 bytes: rows of buffers begin where a processor's wide registers do
 NARROW = 64  # a product with fewer inputs or outputs gains nothing from bfloat16 on a CPU
 
 
@@ -134,7 +131,7 @@ class Pass:
         ensemble, runs, batch = self.shape
         self.widths = [x.shape[-1] for x in inputs]
         self.outputs = torch.empty(*self.shape, sizes[-1])
-        x = [_with_ones(batch, sizes[0]) for _ in range(runs)]
+        x = [rows_with_ones(batch, sizes[0]) for _ in range(runs)]
         starts = [0, *itertools.accumulate(self.widths)]
         self.calls: list[Call] = [
             partial(np.copyto, x[run][:, start:end], part[run])
@@ -144,16 +141,16 @@ class Pass:
         self.layers = [_array(layer) for layer, _ in layers_of(flat, sizes)]  # each [ensemble, runs, in + 1, out]
         # what goes into each layer, [batch, in + 1], of each perceptron
         self.into: dict[tuple[int, int], list[Array]] = {}
-        self.halves: dict[tuple[int, int, int], _Half] = {}  # the layers in bfloat16, of each perceptron
+        self.halves: dict[tuple[int, int, int], Bfloat16Layer] = {}  # the layers in bfloat16, of each perceptron
         outputs = _array(self.outputs)
         for member, run in itertools.product(range(ensemble), range(runs)):
             h, self.into[member, run] = x[run], [x[run]]
             for layer, width in enumerate(sizes[1:-1]):
-                make = _with_ones if keep else _shared(f"layer {layer}", _with_ones)
+                make = rows_with_ones if keep else shared(f"layer {layer}", rows_with_ones)
                 into = make(batch, width)
                 weight = self.layers[layer][member, run]
                 if half and min(sizes[layer], width) >= NARROW:
-                    product = self.halves[member, run, layer] = _Half(h, weight, into[:, :-1], keep)
+                    product = self.halves[member, run, layer] = Bfloat16Layer(h, weight, into[:, :-1], keep)
                     self.calls.append(product.forward)
                 else:
                     self.calls.append(partial(np.matmul, h, weight, into[:, :-1]))
@@ -208,7 +205,7 @@ class PassBack:
                     else:
                         self.calls.append(partial(half.of_weight, torch.from_numpy(of_layer)))
                 if layer:
-                    before = _shared(f"gradient {layer % 2}", _rows)(batch, sizes[layer])
+                    before = shared(f"gradient {layer % 2}", rows)(batch, sizes[layer])
                     if half is None:
                         self._product(g, weight.T, before)
                     else:
@@ -223,7 +220,7 @@ class PassBack:
                         if member == 0:
                             self._product(g, part, of_input)
                         else:
-                            other = _shared("gradient of an input", _rows)(batch, width)
+                            other = shared("gradient of an input", rows)(batch, width)
                             self._product(g, part, other)
                             self.calls.append(partial(np.add, of_input, other, of_input))
                     start += width
@@ -241,53 +238,6 @@ class PassBack:
             call()
 
 
-class _Half:
-    """The product h @ [W; b] of one layer in bfloat16, and its gradients: factors and results are rounded.
-
-    Args:
-        h: [batch, in + 1], its last column ones.
-        weight: [in + 1, out].
-        out: [batch, out].
-        keep: whether a backward pass may follow.
-    """
-
-    def __init__(self, h: Array, weight: Array, out: Array, keep: bool) -> None:
-        self._h, self._weight, self._out = map(torch.from_numpy, (h, weight, out))
-        batch, (rows, columns) = len(h), weight.shape
-        self._half_h = (_halves if keep else _shared("inputs", _halves))(batch, rows)
-        self._half_weight = (_halves if keep else _shared("weights", _halves))(rows, columns)
-        self._half_out = _shared("product", _halves)(batch, columns)
-        if keep:
-            self._half_gradient = _shared("gradient", _halves)(batch, columns)
-            self._half_of_weight = _shared("product", _halves)(rows, columns)
-            self._half_of_h = _shared("product", _halves)(batch, rows - 1)
-
-    def forward(self) -> None:
-        """Compute `out`."""
-        self._half_h.copy_(self._h)
-        self._half_weight.copy_(self._weight)
-        torch.mm(self._half_h, self._half_weight, out=self._half_out)
-        self._out.copy_(self._half_out)
-
-    def load(self, gradient: Tensor) -> None:
-        """Take the gradient of `out`, [batch, out], of which the other gradients follow."""
-        self._half_gradient.copy_(gradient)
-
-    def of_weight(self, out: Tensor) -> None:
-        """Compute the gradient of `weight`."""
-        torch.mm(self._half_h.T, self._half_gradient, out=self._half_of_weight)
-        out.copy_(self._half_of_weight)
-
-    def of_h(self, out: Tensor) -> None:
-        """Compute the gradient of `h` without its ones, [batch, in]."""
-        torch.mm(self._half_gradient, self._half_weight[:-1].T, out=self._half_of_h)
-        out.copy_(self._half_of_h)
-
-
-def _halves(rows: int, columns: int) -> Tensor:
-    return torch.empty(rows, columns, dtype=torch.bfloat16)
-
-
 def _through(activation: str, gradient: Array, h: Array) -> Call:
     """Return the call that turns the gradient of an activation's output h into that of its input, in place."""
     g, output = torch.from_numpy(gradient), torch.from_numpy(h)
@@ -300,32 +250,3 @@ def _array(tensor: Tensor) -> Array:
     """Return a NumPy array that shares a tensor's memory."""
     array: Array = tensor.detach().numpy()
     return array
-
-
-def _rows(batch: int, width: int) -> Array:
-    """Return an array [batch, width] whose rows are aligned."""
-    padded = -(-width // ALIGNED) * ALIGNED
-    return torch.zeros(batch, padded).numpy()[:, :width]
-
-
-def _with_ones(batch: int, width: int) -> Array:
-    """Return an array [batch, width + 1] whose last column is 1."""
-    array = _rows(batch, width + 1)
-    array[:, -1] = 1
-    return array
-
-
-_SCRATCH = threading.local()
-
-
-def _shared(use: str, make: Callable[[int, int], Buffer]) -> Callable[[int, int], Buffer]:
-    """Return `make` whose arrays all passes of this thread share, for what is used up within one pass."""
-
-    def shared(batch: int, width: int) -> Buffer:
-        arrays: dict[object, Buffer] = _SCRATCH.__dict__.setdefault("arrays", {})
-        key = (use, make, batch, width)
-        if key not in arrays:
-            arrays[key] = make(batch, width)
-        return arrays[key]
-
-    return shared

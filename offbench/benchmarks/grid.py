@@ -27,7 +27,7 @@ from offbench.common.files import JsonObject, damage, read_text
 from offbench.common.settings import build
 from offbench.common.text import LARGEST
 from offbench.data import minari_store
-from offbench.data.levels import parse_level
+from offbench.data.levels import parse_level, recipe_and_level
 from offbench.envs.recipes import load_recipe
 from offbench.training.spec import Times
 
@@ -139,7 +139,7 @@ def _source(value: object, folder: Path, where: str) -> Source:
         return dataclasses.replace(source, env=env, level=source.level or ("medium" if env else ""))
     if not isinstance(value, str):
         raise OffbenchError(f"{where}: datasets must be ids or tables, not {value!r}")
-    env, level = minari_store.recorded_by(minari_store.check_id(value))
+    env, level = recipe_and_level(minari_store.check_id(value))
     if env and value.rpartition("-v")[2] != str(load_recipe(env).version):
         return Source(value)  # of another version, such as one of D4RL's: it can be used but not recorded
     return Source(value, env, level)

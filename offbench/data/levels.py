@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from offbench.common.errors import OffbenchError, unknown
+from offbench.envs.recipes import names
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,26 @@ def parse_level(text: str) -> tuple[str, tuple[Part, ...]]:
     if not 0 < fraction <= 1:
         raise OffbenchError(f"a fraction for --level must be more than 0 and at most 1, not {text}")
     return f"{_percent(fraction)}percent", (Part(str(fraction)),)
+
+
+def recipe_and_level(dataset_id: str) -> tuple[str, str]:
+    """Return the shipped recipe and the `--level` that an id such as `hopper-60percent-v0` names, else ("", "")."""
+    body = dataset_id.rpartition("-v")[0]
+    for env in sorted(names(), key=len, reverse=True):
+        level = body.removeprefix(f"{env}-")
+        if level != body:
+            return env, _level(level)
+    return "", ""
+
+
+def _level(name: str) -> str:
+    """Return what `--level` takes for a level's name in an id: 60percent is 0.6."""
+    if name.endswith("percent"):
+        try:
+            return f"{float(name.removesuffix('percent').replace('p', '.')) / 100:g}"
+        except ValueError:
+            return name
+    return name
 
 
 def parse_mix(text: str) -> tuple[str, tuple[Part, ...]]:

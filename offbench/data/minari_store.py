@@ -22,10 +22,10 @@ from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
 from offbench.common.files import ORPHANS, JsonObject, damage, disk_errors, exclusive_lock, read_json
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.settings import read_back, setting
-from offbench.data.levels import parse_level
+from offbench.data.levels import parse_level, recipe_and_level
 from offbench.envs.environments import Space, parse_spec
 from offbench.envs.margin_rule import ADDED, EARLIER
-from offbench.envs.recipes import load_recipe, names
+from offbench.envs.recipes import load_recipe
 from offbench.rollouts.rollouts import Episode
 
 with warnings.catch_warnings():
@@ -109,26 +109,6 @@ def local_ids(unreadable: Callable[[OSError], None] | None = None) -> list[str]:
     return sorted(ids)
 
 
-def recorded_by(dataset_id: str) -> tuple[str, str]:
-    """Return the shipped recipe and the `--level` that an id such as `hopper-60percent-v0` names, else ("", "")."""
-    body = dataset_id.rpartition("-v")[0]
-    for env in sorted(names(), key=len, reverse=True):
-        level = body.removeprefix(f"{env}-")
-        if level != body:
-            return env, _level(level)
-    return "", ""
-
-
-def _level(name: str) -> str:
-    """Return what `--level` takes for a level's name in an id: 60percent is 0.6."""
-    if name.endswith("percent"):
-        try:
-            return f"{float(name.removesuffix('percent').replace('p', '.')) / 100:g}"
-        except ValueError:
-            return name
-    return name
-
-
 def _absent(dataset_id: str) -> OffbenchError:
     """Return the error for a dataset that is not here: how to record this very one, else the nearest that is here."""
     if os.path.isfile(dataset_id):  # unlike Path.is_file, False for a name that no file can have
@@ -138,7 +118,7 @@ def _absent(dataset_id: str) -> OffbenchError:
         path = Path(dataset_id).absolute()
         what = f"a folder, not a dataset's id; set MINARI_DATASETS_PATH={path.parent} and give {path.name}"
         return OffbenchError(f"{dataset_id} is {what}")
-    env, level = recorded_by(dataset_id)
+    env, level = recipe_and_level(dataset_id)
     with contextlib.suppress(OffbenchError):  # no level
         name = f"{env}-{parse_level(level)[0]}-v{load_recipe(env).version}"
         command = f"`offbench collect {env} --level {level}`"

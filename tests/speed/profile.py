@@ -17,6 +17,7 @@ import torch
 
 from offbench.agents.ladder import read_ladder
 from offbench.algorithm import mlp
+from offbench.algorithm.bfloat16_layer import Bfloat16Layer
 from offbench.algorithm.cpu_capture import Recording
 from offbench.algorithm.mlp import products_by
 from offbench.common.files import write_bytes
@@ -103,7 +104,7 @@ def calls(recording: Recording) -> Iterator[tuple[str, Callable[[], object]]]:
         if isinstance(owner, mlp.Pass | mlp.PassBack):
             for inner in owner.calls:
                 function = inner.func if isinstance(inner, partial) else inner
-                half = isinstance(getattr(function, "__self__", None), mlp._Half)
+                half = isinstance(getattr(function, "__self__", None), Bfloat16Layer)
                 named = {np.matmul: PRODUCTS, np.copyto: REST}
                 yield HALVES if half else named.get(function, ACTIVATIONS), inner
         else:
