@@ -1,4 +1,7 @@
-"""Ctrl-C and SIGTERM: collected while something is finished first, such as a checkpoint, and then raised again."""
+"""Ctrl-C and SIGTERM: collected while something is finished first, such as a checkpoint, and then raised again.
+
+offbench.training.trainer writes the checkpoint, offbench.training.jobs ends the worker processes.
+"""
 
 from __future__ import annotations
 
