@@ -164,7 +164,10 @@ class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
         kwargs = kwargs or {}
         result = func(*args, **kwargs)
         if _UNREPEATABLE & set(func.tags):
-            self.problem = self.problem or f"it calls {func}"
+            what = f"calls {func}"
+            if torch.Tag.nondeterministic_seeded in func.tags:
+                what = f"draws random numbers by {func}, which a resumed run would not repeat; use noise_spec"
+            self.problem = self.problem or f"it {what}"
         elif func._schema.is_mutable:
             self.recording.changed((args, kwargs))
             self.recording.add(func, (args, kwargs), (), _single(func, args, kwargs))

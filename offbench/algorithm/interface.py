@@ -160,7 +160,9 @@ class Algorithm(Generic[C]):
 
         It is a `tanh` policy, or a `squashed_gaussian` if the network has two outputs for each action dimension.
         """
-        actor: Network = self.actor  # type: ignore[attr-defined]
+        actor = getattr(self, "actor", None)
+        if not isinstance(actor, Network):
+            raise OffbenchError(f"{type(self).__name__} has no network `actor`: make it in setup, or define policy")
         kind = "tanh" if actor.sizes[-1] == self.action_dim else "squashed_gaussian"
         return PolicyParts(kind, actor.layers(run), activation=actor.activation)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from offbench.analysis.methods import find_method
-from offbench.analysis.results import REFERENCES, Entry, Task, Trained, read_results, window_words
+from offbench.analysis.results import REFERENCES, Entry, Task, Trained, one_code, read_results, window_words
 from offbench.analysis.statistics import Estimate, Paired, improvement, paired
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
@@ -42,6 +42,7 @@ class Comparison:
         windows: which evaluations are behind the scores of A's and of B's paired runs, in words.
         comparable: whether both runs of each pair are scored over evaluations at the same steps.
         unfinished: how many of the paired runs have not reached their last step, or have diverged.
+        changed: the algorithms whose paired runs were trained by different code.
     """
 
     a: str
@@ -54,6 +55,7 @@ class Comparison:
     windows: tuple[str, str]
     comparable: bool
     unfinished: int
+    changed: tuple[str, ...]
 
     def __repr__(self) -> str:
         """Return the verdict."""
@@ -105,6 +107,8 @@ class Comparison:
             )
         if self.unfinished:
             lines.append(f"note: {self.unfinished} of the paired runs did not reach their last step")
+        for algorithm in self.changed:
+            lines.append(f"note: the runs of {algorithm} were trained by different code of the algorithm")
         if self.unpaired:
             verbs = ("has", "is") if self.unpaired == 1 else ("have", "are")
             lines.append(
@@ -132,6 +136,7 @@ class Comparison:
             "unpaired": self.unpaired,
             "unfinished": self.unfinished,
             "comparable": self.comparable,
+            "changed": list(self.changed),
             "verdict": self.verdict,
         }
 
@@ -173,7 +178,16 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
         (window_words(trained[0]), window_words(trained[1])),
         comparable(both),
         sum(t.state != "finished" for side in trained for t in side),
+        _changed([t for side in trained for t in side]),
     )
+
+
+def _changed(runs: Iterable[Trained]) -> tuple[str, ...]:
+    """Return the algorithms whose runs were trained by different code."""
+    of: dict[str, list[Trained]] = {}
+    for trained in runs:
+        of.setdefault(trained.config.algorithm, []).append(trained)
+    return tuple(name for name, same in of.items() if not one_code(same))
 
 
 Partners = Sequence[tuple[Task, Trained, Trained]]

@@ -50,13 +50,16 @@ def score_some(runs: Iterable[Run]) -> list[Row]:
     return _rows(entries_of(runs)[0])
 
 
-def count_waiting(runs: str | Path) -> int:
-    """Return how many runs below a folder have no evaluation yet; damaged ones are not counted."""
-    count = 0
+def without_evaluation(runs: str | Path) -> tuple[int, int]:
+    """Return how many runs below a folder have no evaluation yet, and how many diverged before their first one.
+
+    Damaged ones are not counted.
+    """
+    diverged = []
     for run in find_runs(Path(runs)):
         with contextlib.suppress(OffbenchError, OSError):
-            count += not run.evaluations()
-    return count
+            diverged += [run.diverged] if not run.evaluations() else []
+    return diverged.count(False), diverged.count(True)
 
 
 def _rows(entries: Collection[Entry]) -> list[Row]:
@@ -77,6 +80,7 @@ def _row(entry: Entry, twins: bool) -> Row:
         "of_steps": entry.steps,
         "evaluations": entry.evaluations,
         "window": " ".join(map(str, entry.window)) if entry.window else None,
+        "one_code": entry.of_one_code,
         "return": mean_return,
     }
     for column, reference in (("score", "dataset"), ("d4rl_score", "d4rl")):
@@ -135,6 +139,7 @@ TITLES: dict[str, str | None] = {
     "algorithm": None,
     "variant": None,
     "window": None,
+    "one_code": None,
     "of_steps": None,  # shown as 50,000 of 1,000,000 in the steps column
     "score": "score (own ref.)",
     "score_std": None,
@@ -218,6 +223,11 @@ def notes(rows: Sequence[Row]) -> list[str]:
     lines = []
     if torn:
         lines.append(f"scores of {', '.join(torn)} are of evaluations at different steps and cannot be compared")
+    lines += [
+        f"the runs of {row['method']} on {row['dataset']} were trained by different code of the algorithm"
+        for row in rows
+        if not row.get("one_code", True)
+    ]
     if any("method" in row for row in rows):
         datasets: dict[Method, dict[str, None]] = {}
         for row in rows:

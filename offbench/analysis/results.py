@@ -149,7 +149,7 @@ class Entry:
     @property
     def of_one_code(self) -> bool:
         """Whether the same code of the algorithm trained all runs, as far as they say: earlier versions did not."""
-        return len({tuple(trained.config.code.items()) for trained in self.runs if trained.config.code}) < 2
+        return one_code(self.runs)
 
     @property
     def evaluations(self) -> int:
@@ -251,6 +251,11 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
     tasks = dict.fromkeys(entry.task for entry in entries)
     ordered = sorted({entry.method for entry in entries}, key=method_order)
     return Results(roots, tuple(tasks), tuple(ordered), {(e.task, e.method): e for e in entries}, tuple(waiting))
+
+
+def one_code(runs: Iterable[Trained]) -> bool:
+    """Return whether the same code of the algorithm trained all runs, as far as their config.json says."""
+    return len({tuple(trained.config.code.items()) for trained in runs if trained.config.code}) < 2
 
 
 def window_words(runs: Iterable[Trained]) -> str:

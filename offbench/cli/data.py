@@ -94,13 +94,12 @@ def list_arguments(parser: Parser, _: list[str]) -> None:
         if json:
             print(dumps(contents, indent=1))
             return
-        for title, header, rows in sections(contents):
-            say(title, "bold")
+        for i, (title, header, rows) in enumerate(sections(contents)):
+            say(f"\n{title}" if i else title, "bold")
             if header:
                 print_table(header, rows, names=2 if title in ("environments", "runs") else 1, group=title == "runs")
             else:
                 print("\n".join(f"  {row[0]}" for row in rows))
-            print()
 
     parser.set_defaults(run=run)
 

@@ -33,12 +33,14 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--plot", metavar="PICTURE", help="also draw the learning curves (.png, .svg, .pdf)")
 
     def run(style: str, plot: str | None, **arguments: Any) -> None:
-        from offbench.analysis.normalize import count_waiting
+        from offbench.analysis.normalize import without_evaluation
 
         print_scores(offbench.normalize(**arguments), style)
-        waiting = 0 if arguments["env"] else count_waiting(arguments["runs"])
+        waiting, diverged = (0, 0) if arguments["env"] else without_evaluation(arguments["runs"])
         if waiting:
             note(f"{counted(waiting, 'run')} without an evaluation yet")
+        if diverged:
+            note(f"{counted(diverged, 'run')} diverged before the first evaluation")
         if plot:
             from offbench.reports.figures import plot_curves
 

@@ -148,7 +148,8 @@ def _shown(value: object) -> str:
 def _check_range(name: str, value: object, metadata: Mapping[str, Any], where: str) -> None:
     choices = metadata.get("choices")
     if isinstance(value, str) and choices and value not in choices:
-        raise _error(where, f"{name} must be one of {', '.join(choices)}, not {value!r}")
+        kind = "a number or" if metadata.get("low") is not None else "one of"
+        raise _error(where, f"{name} must be {kind} {', '.join(choices)}, not {value!r}")
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
     if isinstance(value, int) and abs(value) > LARGEST:

@@ -233,7 +233,7 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
         with damage(str(path), "is not a readable policy file", "give another, or write it again"):
             return from_bytes(read_bytes(Path(path)))
     except FileNotFoundError:
-        raise OffbenchError(f"no policy file {path}") from None
+        raise OffbenchError(f"no run or policy file {path}") from None
 
 
 def from_bytes(data: bytes) -> Policy:

@@ -215,6 +215,7 @@ def _from_file(reference: str) -> type[Algorithm]:
         return kinds[name]
     if name or len(kinds) != 1:
         what = f"no algorithm {name!r}" if name else "several algorithms" if kinds else "no algorithm"
+        what += "" if kinds else ", a subclass of offbench.algorithm.Algorithm"
         hint = f"; name one: {text}:{' or :'.join(kinds)}" if kinds else ""
         raise OffbenchError(f"{text} has {what}{hint}")
     return next(iter(kinds.values()))
@@ -229,6 +230,8 @@ def _checked(kind: type, what: str) -> type[Algorithm]:
     config = getattr(kind, "Config", None)
     if not (isinstance(config, type) and dataclasses.is_dataclass(config)):
         raise OffbenchError(f"{what}: Config must be a dataclass of settings")
+    if config.__hash__ is None:
+        raise OffbenchError(f"{what}: Config must be frozen: @dataclass(frozen=True)")
     for needed in NEEDED:
         if needed not in {field.name for field in dataclasses.fields(config)}:
             raise OffbenchError(f"{what}: its Config lacks the setting {needed}")

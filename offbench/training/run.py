@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import (
     JsonObject,
     csv_bytes,
@@ -173,37 +173,47 @@ class Run:
     def claim(self, config: RunConfig) -> None:
         """Write config.json, or check that the run in this folder is the same one.
 
+        A run without a checkpoint starts over.
+
         Raises:
             OffbenchError: the folder holds another run, or one whose config.json is gone.
         """
+        if self.config_path.exists() and (reason := self._refusal(config)):
+            if self.begun:
+                raise OffbenchError(f"{reason}; {TRAIN_ANEW}")
+            self.clear()
         if self.config_path.exists():
-            existing = self.config()
-            for key in MUST_MATCH:
-                old, new = getattr(existing, key), getattr(config, key)
-                if key == "settings":
-                    old = current_settings(existing.algorithm, old, str(self.folder))
-                if old == new:
-                    continue
-                if key == "dataset_sha256":
-                    raise OffbenchError(
-                        f"{self.folder} was trained on another content of {config.dataset}, which has been recorded "
-                        f"again since; {TRAIN_ANEW}"
-                    )
-                flag = f"--{key.replace('_', '-')}" if key.startswith("eval") else key
-                raise OffbenchError(f"{self.folder} was started with {flag} {old}, not {new}; {TRAIN_ANEW}")
-            if changed := changes(existing.code, config.code):
-                raise OffbenchError(
-                    f"{self.folder} was trained by other code of {config.algorithm}: {changed}; {TRAIN_ANEW}"
-                )
-        elif any(self.folder.glob("checkpoint-*.safetensors")):
+            return
+        if self.begun:
             raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
-        else:
-            with self.locked():
-                if not self.config_path.exists():
-                    values = dataclasses.asdict(config)
-                    write_json(self.config_path, {k: v for k, v in values.items() if k != "sessions" or v})
-                    return
-            self.claim(config)  # another process was faster
+        with self.locked():
+            if not self.config_path.exists():
+                values = dataclasses.asdict(config)
+                write_json(self.config_path, {k: v for k, v in values.items() if k != "sessions" or v})
+                return
+        self.claim(config)  # another process was faster
+
+    @property
+    def begun(self) -> bool:
+        """Whether the folder has a checkpoint; a run that stopped before its first one starts over."""
+        return any(self.folder.glob("checkpoint-*.safetensors"))
+
+    def _refusal(self, config: RunConfig) -> str:
+        """Return why the run in this folder is not the one of `config`, "" if it is."""
+        existing = self.config()
+        for key in MUST_MATCH:
+            old, new = getattr(existing, key), getattr(config, key)
+            if key == "settings":
+                old = current_settings(existing.algorithm, old, str(self.folder))
+            if old == new:
+                continue
+            if key == "dataset_sha256":
+                what = f"another content of {config.dataset}, which has been recorded again since"
+                return f"{self.folder} was trained on {what}"
+            flag = f"--{key.replace('_', '-')}" if key.startswith("eval") else key
+            return f"{self.folder} was started with {flag} {old}, not {new}"
+        changed = changes(existing.code, config.code)
+        return f"{self.folder} was trained by other code of {config.algorithm}: {changed}" if changed else ""
 
     def clear(self) -> None:
         """Delete what the folder holds, if it holds a run, so that it is trained again."""
@@ -265,6 +275,8 @@ class Run:
                 are not those of config.json.
         """
         if not self.evaluations_path.exists():
+            if self.begun:  # a checkpoint is written after it
+                raise DamagedError(f"{self.evaluations_path} is missing; put it back, or delete the run to repeat it")
             return {}
         config = self.config() if self.config_path.exists() else None
         last, count = (config.steps, config.eval_episodes) if config else (LARGEST, 0)

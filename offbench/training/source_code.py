@@ -86,6 +86,8 @@ def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Return what differs between two `code_of`, for an error line; "" for nothing, or if either is missing."""
     if not before or not now:
         return ""
+    if not set(before) & set(now):
+        return f"{', '.join(before)}, not {', '.join(now)}"
     differ = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     return ", ".join(f"{name} {_how(before.get(name), now.get(name))}" for name in differ)
 

@@ -18,7 +18,7 @@ from offbench.common.settings import build
 from offbench.data import transitions
 from offbench.envs.recipes import load_recipe
 from offbench.training.devices import Machine, pick_machine
-from offbench.training.grouping import check_datasets, group, load_datasets, pending
+from offbench.training.grouping import Datasets, check_datasets, group, load_datasets, pending
 from offbench.training.jobs import raise_first, run_jobs
 from offbench.training.loggers import NOWHERE, Destinations
 from offbench.training.registry import algorithm_names, current_settings, is_local, load_algorithm, use
@@ -133,6 +133,8 @@ class Training:
         check_datasets(self._datasets)
         self._groups = [replace(job, show=show) for job in group(specs, self._datasets, machine)]
         if fresh:
+            for job in self._groups:  # code that fails deletes nothing
+                _try_update(job.first, self._datasets)
             for spec in specs:
                 spec.run.clear()
         self.jobs = self.pending()
@@ -171,6 +173,13 @@ class Training:
         return execute(jobs, 1 if local else self.machine.processes) if jobs else []
 
 
+def _try_update(spec: RunSpec, datasets: Datasets) -> None:
+    """Do the first update of a run on the CPU, and forget it."""
+    stack = Stack(load_algorithm(spec.algorithm), [spec], {spec.dataset: datasets[spec.dataset]}, "cpu")
+    for _ in stack.train(1):
+        pass
+
+
 def _seed_list(seeds: int | Sequence[int]) -> tuple[int, ...]:
     return tuple(map(check_seed, seeds if isinstance(seeds, Iterable) else [seeds]))
 
@@ -204,7 +213,9 @@ def restore(run: Run, algorithm: str | type | None = None) -> Stack:
         raise OffbenchError(f"{error}; for a file of your own, give --algorithm ./FILE.py:CLASS") from None
     recorded = current_settings(config.algorithm, config.settings, str(run.folder))
     if changed := changes(config.code, code_of(config.algorithm)):
-        raise OffbenchError(f"{run.folder} was trained by other code of {config.algorithm}: {changed}")
+        raise OffbenchError(
+            f"{run.folder} was trained by other code of {config.algorithm}: {changed}; restore it, or train again"
+        )
     settings = build(kind.Config, recorded, f"{run.config_path}: settings")
     data = transitions.load(config.dataset)
     if data.content != config.dataset_sha256:

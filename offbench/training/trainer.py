@@ -126,8 +126,8 @@ class Trainer:
         for i, tensor in self.stack.diverged().items():
             if i not in self.diverged:
                 run, step = self.runs[i], self.stack.step
-                self.diverged[i] = (
-                    f"{run.folder}: {tensor} became NaN or infinite by step {step}; its last checkpoint is kept"
+                self.diverged[i] = f"{run.folder}: {tensor} became NaN or infinite by step {step}" + (
+                    "; its last checkpoint is kept" if run.begun else ""
                 )
                 run.mark_diverged(step, tensor)
 

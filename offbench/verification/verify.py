@@ -76,7 +76,8 @@ def _verify(dataset_id: str, episodes: int | None, workers: int | None) -> Repor
         with reading(dataset_id):
             survey = scan(data, limit, findings)
     except DamagedError as error:
-        findings.add(code, dataset_id, str(error))
+        text = str(error)
+        findings.add(code, dataset_id, text.rpartition("; ")[0] or text)  # the finding has a remedy of its own
         report.findings = findings.all()
         return report
     report.transitions, report.episodes = survey.steps, len(survey.lengths)

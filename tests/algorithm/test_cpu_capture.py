@@ -260,3 +260,5 @@ def test_a_record_is_done_as_well() -> None:
     assert total.tolist() == [4, 4, 4]
     with pytest.raises(NotCapturableError, match=r"item|local_scalar"):
         record(lambda: total.sum().item())
+    with pytest.raises(NotCapturableError, match=r"draws random numbers by aten\.rand.*resumed run.*noise_spec"):
+        record(lambda: torch.rand(3))

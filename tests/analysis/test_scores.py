@@ -19,7 +19,7 @@ from offbench.cli.main import main
 from offbench.common.scores import interval, mean_std, normalize, run_return
 from offbench.envs.recipes import d4rl_reference
 from offbench.reports.figures import plot_curves
-from offbench.training.run import Run, RunConfig
+from offbench.training.run import Run, RunConfig, find_runs
 
 
 def test_normalize_by_hand() -> None:
@@ -178,6 +178,10 @@ def test_runs_without_an_evaluation_are_counted(capsys: pytest.CaptureFixture[st
         said = capsys.readouterr()
         assert said.err == f"{words}\n"
         assert json.loads(said.out)[0]["seeds"] == 1
+    next(run for run in find_runs(Path("runs")) if not run.evaluations()).mark_diverged(5, "actor.flat")
+    main(["normalize"])
+    notes = "note: 1 run without an evaluation yet\nnote: 1 run diverged before the first evaluation\n"
+    assert capsys.readouterr().err == notes
     main(["normalize", "--env", "hopper", "1000"])
     assert capsys.readouterr().err == ""
 

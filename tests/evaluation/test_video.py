@@ -100,7 +100,7 @@ def test_the_users_choice_of_backend_is_put_back(monkeypatch: pytest.MonkeyPatch
         (["hopper:mediun", "--out", "a.gif"], "did you mean 'medium'"),
         (["hoper:medium", "--out", "a.gif"], "did you mean 'hopper'"),
         (["ant:medium", "--out", "a.gif"], "no ladder"),
-        (["nothing", "--out", "a.gif"], "no policy file"),
+        (["nothing", "--out", "a.gif"], "no run or policy file"),
         ([str(POLICY), "--out", "new/a.gif"], "cannot write new/a.gif: there is no folder new"),
         ([str(POLICY), "--env", "hopper", "--out", "a.gif"], "--env RECIPE"),
         ([str(POLICY), "--seconds", "0", "--out", "a.gif"], "more than 0"),

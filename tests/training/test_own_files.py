@@ -177,6 +177,41 @@ def test_an_edit_is_noticed_and_a_comment_is_none(home: Path, capsys: pytest.Cap
     assert run.evaluations().keys() == {10, 20}
 
 
+def test_code_that_fails_at_once_can_be_mended(home: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A run without a checkpoint starts over with the new code; --fresh deletes nothing for code that fails."""
+    file, train = home / "awac.py", ["train", "awac.py", *WORDS, "--steps", "10"]
+    broken = EXAMPLE.replace("self.critic.minimize(critic_loss)", "raise ValueError('oh')")
+    file.write_text(broken)
+    with pytest.raises(SystemExit):
+        main(train)
+    again(home)
+    file.write_text(EXAMPLE)
+    main(train)
+    again(home)
+    (run,) = (Run(path.parent) for path in Path("runs").rglob("config.json"))
+    before = run.policy_path.read_bytes()
+    assert run.evaluations().keys() == {10}
+    file.write_text(broken)
+    with pytest.raises(SystemExit):
+        main([*train, "--fresh"])
+    assert capfd.readouterr().err.count("an error in awac: ValueError: oh") == 2
+    assert run.policy_path.read_bytes() == before
+
+
+@pytest.mark.parametrize(("frozen", "message"), [("False", "frozen=True"), ("True", "has no network `actor`")])
+def test_a_class_that_lacks_something_is_told_what(
+    frozen: str, message: str, home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (home / "mine.py").write_text(
+        "from dataclasses import make_dataclass\nfrom offbench.algorithm import Algorithm\n"
+        "settings = [('batch_size', int, 16), ('normalize', bool, False)]\n"
+        f"Config = make_dataclass('Config', settings, frozen={frozen})\n"
+        "class Mine(Algorithm[Config]):\n    Config = Config\n    def setup(self, c): pass\n"
+        "    def update(self, batch, noise, phase): return {}\n"
+    )
+    assert message in refusal(["train", "mine.py", *WORDS[:6], "--steps", "10"], capsys)
+
+
 def test_an_edit_of_an_imported_neighbor_is_noticed(home: Path) -> None:
     (home / "losses.py").write_text("WEIGHT = 100\n")
     (home / "awac.py").write_text(
@@ -309,7 +344,7 @@ def test_two_algorithms_of_one_name_are_refused(home: Path) -> None:
         registry.use("three.py")
 
 
-def test_a_report_marks_a_cell_of_different_code(home: Path) -> None:
+def test_tables_mark_a_cell_of_different_code(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Runs of earlier versions, which name no code, count as the same."""
     for number, codes in enumerate((["a", "a", ""], ["a", "b", ""])):
         for seed, code in enumerate(codes):
@@ -319,3 +354,9 @@ def test_a_report_marks_a_cell_of_different_code(home: Path) -> None:
         table = score_table(read_results(home / str(number)))
         assert ("§" in table.rows[0][2].text) == bool(number)
         assert any("trained by different code" in note for note in table.notes) == bool(number)
+        for seed in range(3):
+            made_run(home / str(number), "hopper-medium-v0", "bc", "default", seed, 50.0)
+        for words in (["normalize"], ["compare", "bdb", "bc"]):
+            main([*words, "--runs", str(home / str(number))])
+            said = "note: the runs of bdb" in (text := capsys.readouterr().out)
+            assert said == ("trained by different code" in text) == bool(number)

@@ -226,6 +226,9 @@ def test_a_run_whose_files_were_deleted_is_not_taken_for_another(medium: str) ->
         path.unlink()
         with pytest.raises(OffbenchError, match=f"{path.name}.*put (it|the file) back, or delete the run"):
             train("td3_bc", medium, "runs", steps)
+        if path == run.evaluations_path:
+            with pytest.raises(OffbenchError, match="is missing; put it back, or delete the run"):
+                offbench.normalize("runs")
         path.write_bytes(kept)
     run.write_evaluations({step: found for step, found in run.evaluations().items() if step != 200})
     with pytest.raises(OffbenchError, match="lacks the evaluation of step 200"):
