@@ -173,18 +173,18 @@ class Run:
     def claim(self, config: RunConfig) -> None:
         """Write config.json, or check that the run in this folder is the same one.
 
-        A run without a checkpoint starts over.
+        A run that stopped before its first checkpoint starts over.
 
         Raises:
             OffbenchError: the folder holds another run, or one whose config.json is gone.
         """
         if self.config_path.exists() and (reason := self._refusal(config)):
-            if self.begun:
+            if self._has_results:
                 raise OffbenchError(f"{reason}; {TRAIN_ANEW}")
             self.clear()
         if self.config_path.exists():
             return
-        if self.begun:
+        if self._has_results:
             raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
         with self.locked():
             if not self.config_path.exists():
@@ -194,9 +194,14 @@ class Run:
         self.claim(config)  # another process was faster
 
     @property
-    def begun(self) -> bool:
-        """Whether the folder has a checkpoint; a run that stopped before its first one starts over."""
+    def has_checkpoint(self) -> bool:
+        """Whether the folder has a checkpoint; it is written after all other files."""
         return any(self.folder.glob("checkpoint-*.safetensors"))
+
+    @property
+    def _has_results(self) -> bool:
+        """Whether the folder has what training writes; a run that stopped before that starts over."""
+        return self.has_checkpoint or self.evaluations_path.exists() or self.policy_path.exists()
 
     def _refusal(self, config: RunConfig) -> str:
         """Return why the run in this folder is not the one of `config`, "" if it is."""
@@ -275,7 +280,7 @@ class Run:
                 are not those of config.json.
         """
         if not self.evaluations_path.exists():
-            if self.begun:  # a checkpoint is written after it
+            if self.has_checkpoint:  # which is written after it
                 raise DamagedError(f"{self.evaluations_path} is missing; put it back, or delete the run to repeat it")
             return {}
         config = self.config() if self.config_path.exists() else None

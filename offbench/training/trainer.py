@@ -127,7 +127,7 @@ class Trainer:
             if i not in self.diverged:
                 run, step = self.runs[i], self.stack.step
                 self.diverged[i] = f"{run.folder}: {tensor} became NaN or infinite by step {step}" + (
-                    "; its last checkpoint is kept" if run.begun else ""
+                    "; its last checkpoint is kept" if run.has_checkpoint else ""
                 )
                 run.mark_diverged(step, tensor)
 
