@@ -82,7 +82,7 @@ class Recording:
         Args:
             constant: it writes the same numbers every time.
         """
-        described = tree_map_only(Tensor, self._describe, reads)
+        described = tree_map_only(float, repr, tree_map_only(Tensor, self._describe, reads))  # NaN equals itself so
         origin = ("call", len(self.calls))
         for tensor in _tensors(writes):
             self._origins.setdefault(_address(tensor), origin)

@@ -108,7 +108,7 @@ class Comparison:
         if self.unfinished:
             lines.append(f"note: {self.unfinished} of the paired runs did not reach their last step")
         for algorithm in self.changed:
-            lines.append(f"note: the runs of {algorithm} were trained by different code of the algorithm")
+            lines.append(f"note: the runs of {algorithm} were trained by different code")
         if self.unpaired:
             verbs = ("has", "is") if self.unpaired == 1 else ("have", "are")
             lines.append(

@@ -15,7 +15,7 @@ import numpy as np
 
 from offbench.agents.ladder import BEHAVIOUR, folder_of, read_ladder
 from offbench.analysis.methods import Method, unnamed_settings
-from offbench.analysis.results import Entry, entries_of, read_results
+from offbench.analysis.results import Entry, entries_of, mixed_code, read_results
 from offbench.analysis.statistics import iqm
 from offbench.common import scores
 from offbench.common.errors import OffbenchError
@@ -63,8 +63,8 @@ def without_evaluation(runs: str | Path) -> tuple[int, int]:
 
 
 def _rows(entries: Collection[Entry]) -> list[Row]:
-    twins = any(entry.task.twin for entry in entries)
-    return [_row(entry, twins) for entry in entries]
+    twins, mixed = any(entry.task.twin for entry in entries), mixed_code(entries)
+    return [_row(entry, twins) | {"one_code": (entry.task, entry.method.algorithm) not in mixed} for entry in entries]
 
 
 def _row(entry: Entry, twins: bool) -> Row:
@@ -80,7 +80,6 @@ def _row(entry: Entry, twins: bool) -> Row:
         "of_steps": entry.steps,
         "evaluations": entry.evaluations,
         "window": " ".join(map(str, entry.window)) if entry.window else None,
-        "one_code": entry.of_one_code,
         "return": mean_return,
     }
     for column, reference in (("score", "dataset"), ("d4rl_score", "d4rl")):
@@ -223,11 +222,8 @@ def notes(rows: Sequence[Row]) -> list[str]:
     lines = []
     if torn:
         lines.append(f"scores of {', '.join(torn)} are of evaluations at different steps and cannot be compared")
-    lines += [
-        f"the runs of {row['method']} on {row['dataset']} were trained by different code of the algorithm"
-        for row in rows
-        if not row.get("one_code", True)
-    ]
+    mixed = dict.fromkeys((row["algorithm"], row["dataset"]) for row in rows if not row.get("one_code", True))
+    lines += [f"the runs of {algorithm} on {dataset} were trained by different code" for algorithm, dataset in mixed]
     if any("method" in row for row in rows):
         datasets: dict[Method, dict[str, None]] = {}
         for row in rows:

@@ -147,11 +147,6 @@ class Entry:
         return {trained.state for trained in self.runs}
 
     @property
-    def of_one_code(self) -> bool:
-        """Whether the same code of the algorithm trained all runs, as far as they say: earlier versions did not."""
-        return one_code(self.runs)
-
-    @property
     def evaluations(self) -> int:
         """The fewest evaluations behind a run's score."""
         return min(len(trained.window) for trained in self.runs)
@@ -256,6 +251,14 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
 def one_code(runs: Iterable[Trained]) -> bool:
     """Return whether the same code of the algorithm trained all runs, as far as their config.json says."""
     return len({tuple(trained.config.code.items()) for trained in runs if trained.config.code}) < 2
+
+
+def mixed_code(entries: Iterable[Entry]) -> set[tuple[Task, str]]:
+    """Return the tasks and algorithms whose runs, of all variants, were trained by different code."""
+    of: dict[tuple[Task, str], list[Trained]] = {}
+    for entry in entries:
+        of.setdefault((entry.task, entry.method.algorithm), []).extend(entry.runs)
+    return {key for key, runs in of.items() if not one_code(runs)}
 
 
 def window_words(runs: Iterable[Trained]) -> str:

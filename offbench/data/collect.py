@@ -86,6 +86,8 @@ def collect(
     if policy is None:
         if name is not None:
             raise OffbenchError("--name goes with --policy; give a dataset's id by --id")
+        if mix is not None and level != "medium":
+            raise OffbenchError("give --level or --mix, not both")
         name, parts = parse_mix(mix) if mix is not None else parse_level(level)
     else:
         if mix is not None or level != "medium":

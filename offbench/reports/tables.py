@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 from offbench.analysis.compare import comparable, differences, favored, partners
 from offbench.analysis.methods import Method, unnamed_settings
-from offbench.analysis.results import REFERENCES, Entry, Results, Task, window_words
+from offbench.analysis.results import REFERENCES, Entry, Results, Task, mixed_code, window_words
 from offbench.analysis.statistics import Estimate, Scores, improvement, iqm, paired
 from offbench.common.scores import LAST, mean_std, plus_minus
 from offbench.common.tables import Cell, Table
@@ -51,7 +51,7 @@ def score_table(results: Results) -> Table:
         if row["source"] == PAPER
     }
     steps = {method: column_steps(results.of(method)) for method in results.methods}
-    seeds = {len(entry.runs) for entry in results.entries.values()}
+    seeds, mixed = {len(entry.runs) for entry in results.entries.values()}, mixed_code(results.entries.values())
     rows = []
     for i, task in enumerate(results.tasks):
         env, level = task.env_and_level
@@ -66,7 +66,8 @@ def score_table(results: Results) -> Table:
             more += [] if ranked else [window_words(entry.runs)]
             number = paper.get((env, level, method.published))
             below = "" if number is None else f"paper {number:g}"
-            cells.append(_score_cell(entry, below, cell_id(i, j), ", ".join(more)))
+            code = " §" if (task, method.algorithm) in mixed else ""
+            cells.append(_score_cell(entry, below, cell_id(i, j), ", ".join(more), code))
         below_row = "" if len({t.reference for t in results.tasks}) == 1 else REFERENCES[task.reference]
         rows.append([*row_name(results, task, below_row), *(_best(cells) if ranked else cells)])
     beside = any(cell.below for row in rows for cell in row[2:])
@@ -104,11 +105,10 @@ def column_steps(entries: Sequence[Entry]) -> str:
     return f"{done:,} steps" if done >= of else f"{done:,} of {of:,} steps"
 
 
-def _score_cell(entry: Entry, below: str, detail: str, more: str) -> Cell:
+def _score_cell(entry: Entry, below: str, detail: str, more: str, code: str) -> Cell:
     score = mean_std(entry.scores)
     marks = [mark for state, mark in (("unfinished", " †"), ("diverged", " ‡")) if state in entry.states]
-    marks += [] if entry.of_one_code else [" §"]
-    text = plus_minus(score) + "".join(marks)
+    text = plus_minus(score) + "".join(marks) + code
     return Cell(text if entry.task.reference else f"return {text}", score[0], below, detail=detail, more=more)
 
 
@@ -144,8 +144,10 @@ def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
         notes.insert(1, "‡ a run became NaN or infinite and stopped: the number is of its evaluations before that.")
     if "unfinished" in states:
         notes.insert(1, "† training is not finished: the number is of the steps done so far and may still change.")
-    if not all(entry.of_one_code for entry in entries):
-        notes.insert(1, "§ the runs were trained by different code of the algorithm, as their config.json says.")
+    if mixed_code(entries):
+        notes.insert(
+            1, "§ the algorithm's runs in this row were trained by different code, as their config.json says."
+        )
     if torn := _torn(entries):
         notes.append(
             f"The datasets of {', '.join(torn)} were recorded with different references: their scores are on "

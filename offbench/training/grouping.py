@@ -129,6 +129,12 @@ def _alike(specs: Sequence[RunSpec], datasets: Datasets) -> list[list[RunSpec]]:
     return [runs for _, runs in groups]
 
 
+def check_folders(job: Job, datasets: Datasets) -> None:
+    """Check that the runs' folders can be claimed, before any of them is. Raises OffbenchError if one cannot."""
+    for spec in job.specs:
+        spec.run.check(_run_config(spec, datasets[spec.dataset], job.device, ""))
+
+
 def pending(job: Job, datasets: Datasets, *, command: str = "") -> list[Job]:
     """Claim the runs' folders, and return what is left to train of them.
 

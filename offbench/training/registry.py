@@ -230,11 +230,11 @@ def _checked(kind: type, what: str) -> type[Algorithm]:
     config = getattr(kind, "Config", None)
     if not (isinstance(config, type) and dataclasses.is_dataclass(config)):
         raise OffbenchError(f"{what}: Config must be a dataclass of settings")
-    if config.__hash__ is None:
-        raise OffbenchError(f"{what}: Config must be frozen: @dataclass(frozen=True)")
     for needed in NEEDED:
         if needed not in {field.name for field in dataclasses.fields(config)}:
             raise OffbenchError(f"{what}: its Config lacks the setting {needed}")
+    if config.__hash__ is None:
+        raise OffbenchError(f"{what}: Config must be frozen: @dataclass(frozen=True)")
     return kind
 
 

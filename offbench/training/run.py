@@ -170,22 +170,30 @@ class Run:
                 session.setdefault("precision", "tf32" if session.get("tf32") else "float32")
         return read_back(RunConfig, values, self.config_path, REPEAT)
 
+    def check(self, config: RunConfig) -> None:
+        """Check that the folder can be claimed; write nothing.
+
+        Raises:
+            OffbenchError: it holds another run that has got to a checkpoint, or one whose config.json is gone.
+        """
+        if self._has_results and not self.config_path.exists():
+            raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
+        if self._has_results and (reason := self._refusal(config)):
+            raise OffbenchError(f"{reason}; {TRAIN_ANEW}")
+
     def claim(self, config: RunConfig) -> None:
-        """Write config.json, or check that the run in this folder is the same one.
+        """Write config.json, unless this very run is there.
 
         A run that stopped before its first checkpoint starts over.
 
         Raises:
-            OffbenchError: the folder holds another run, or one whose config.json is gone.
+            OffbenchError: as `check`.
         """
-        if self.config_path.exists() and (reason := self._refusal(config)):
-            if self._has_results:
-                raise OffbenchError(f"{reason}; {TRAIN_ANEW}")
+        self.check(config)
+        if self.config_path.exists() and self._refusal(config):
             self.clear()
         if self.config_path.exists():
             return
-        if self._has_results:
-            raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
         with self.locked():
             if not self.config_path.exists():
                 values = dataclasses.asdict(config)

@@ -18,7 +18,7 @@ from offbench.common.settings import build
 from offbench.data import transitions
 from offbench.envs.recipes import load_recipe
 from offbench.training.devices import Machine, pick_machine
-from offbench.training.grouping import Datasets, check_datasets, group, load_datasets, pending
+from offbench.training.grouping import Datasets, check_datasets, check_folders, group, load_datasets, pending
 from offbench.training.jobs import raise_first, run_jobs
 from offbench.training.loggers import NOWHERE, Destinations
 from offbench.training.registry import algorithm_names, current_settings, is_local, load_algorithm, use
@@ -137,6 +137,8 @@ class Training:
                 _try_update(job.first, self._datasets)
             for spec in specs:
                 spec.run.clear()
+        for job in self._groups:
+            check_folders(job, self._datasets)
         self.jobs = self.pending()
         self.diverged = [
             f"{spec.folder} has diverged and is not trained further; delete it to repeat it"

@@ -260,5 +260,7 @@ def test_a_record_is_done_as_well() -> None:
     assert total.tolist() == [4, 4, 4]
     with pytest.raises(NotCapturableError, match=r"item|local_scalar"):
         record(lambda: total.sum().item())
+    first, again = (record(lambda: total.mul_(float("nan"))) for _ in range(2))
+    assert first.same_as(again)
     with pytest.raises(NotCapturableError, match=r"draws random numbers by aten\.rand.*resumed run.*noise_spec"):
         record(lambda: torch.rand(3))

@@ -42,6 +42,7 @@ CASES: dict[str, tuple[str, str]] = {
     "collect hopper --id /tmp/x-v0": ("is not a dataset id", ""),
     "collect hopper --mix random": ("--mix takes LEVEL:SHARE", ""),
     "collect hopper --mix random:0.5,expert:0.4": ("must add up to 1, not 0.9", ""),
+    "collect hopper --level expert --mix random:0.5,expert:0.5": ("give --level or --mix, not both", ""),
     "collect hopper --mix randm:0.5,expert:0.5": ("unknown level 'randm': did you mean 'random'?", ""),
     "collect hopper --mix medium-expert:0.5,random:0.5": ("--mix takes single levels", ""),
     "collect ./none.toml": ("no recipe file none.toml", ""),

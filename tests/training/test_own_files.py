@@ -356,8 +356,10 @@ def test_tables_mark_a_cell_of_different_code(home: Path, capsys: pytest.Capture
             run = made_run(home / str(number), "hopper-medium-v0", "bdb", "default", seed, 50.0)
             config = json.loads(run.config_path.read_text())
             run.config_path.write_text(json.dumps(config | {"code": {"bdb.py": code} if code else {}}))
+        made_run(home / str(number), "hopper-medium-v0", "bdb", "beta=0.5", 0, 50.0)  # another variant, of no code
         table = score_table(read_results(home / str(number)))
         assert ("§" in table.rows[0][2].text) == bool(number)
+        assert ("§" in table.rows[0][3].text) == bool(number)
         assert any("trained by different code" in note for note in table.notes) == bool(number)
         for seed in range(3):
             made_run(home / str(number), "hopper-medium-v0", "bc", "default", seed, 50.0)

@@ -19,7 +19,7 @@ from offbench.cli.main import main
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
 from offbench.training.registry import algorithm_names
-from offbench.training.run import Run, Session
+from offbench.training.run import Run, Session, find_runs
 
 SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 100, "eval_episodes": 2, "workers": 1}
 HALF: dict[str, Any] = {"precision": "bfloat16", "hidden": (64, 64)}  # a CPU multiplies narrower layers in float32
@@ -233,6 +233,13 @@ def test_a_run_whose_files_were_deleted_is_not_taken_for_another(medium: str) ->
     run.write_evaluations({step: found for step, found in run.evaluations().items() if step != 200})
     with pytest.raises(OffbenchError, match="lacks the evaluation of step 200"):
         train("td3_bc", medium, "runs", 400)
+
+
+def test_a_refused_command_makes_no_run_folder(medium: str) -> None:
+    train("td3_bc", medium, "runs", 100)
+    with pytest.raises(OffbenchError, match="was started with --eval-every 100, not 50"):
+        train("td3_bc", medium, "runs", 100, seeds=[1, 0], eval_every=50)
+    assert len(find_runs(Path("runs"))) == 1
 
 
 def test_a_deleted_policy_comes_back_from_the_checkpoint(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
