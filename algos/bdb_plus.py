@@ -1,11 +1,9 @@
-"""BDB+: BDB (bdb.py) with its paper's future work and remedies for an adaptive beta near 1 at first; all ours.
+"""BDB+: BDB (bdb.py) with its paper's future work and a remedy for an adaptive beta near 1 at first; all ours.
 
-    uncertainty = relative   Unc = uncertainty_scale (max_i Q_i - min_i Q_i) / mean |Q_1|: does not wait for Q to grow
-    beta_max                 adaptive and learned beta stay below it
-    cloning_steps            updates at the start whose constraint is cloning alone
-    beta = learned           beta = sigmoid(b), trained to hold the cloning error at beta_target
-    critic_penalty = cql     the critics are pushed down off the data, up on it, as in CQL:
-                             loss + penalty_weight sum_i mean [logsumexp_j Q_i(s, a_j) - Q_i(s, a)]
+    beta_max               adaptive and learned beta stay below it
+    beta = learned         beta = sigmoid(b), trained to hold the cloning error at beta_target
+    critic_penalty = cql   the critics are pushed down off the data, up on it, as in CQL:
+                           loss + penalty_weight sum_i mean [logsumexp_j Q_i(s, a_j) - Q_i(s, a)]
 
 Each is off by default, and then every number is BDB's, bit for bit. `diff algos/bdb.py algos/bdb_plus.py` shows them.
 """
@@ -13,7 +11,6 @@ Each is off by default, and then every number is BDB's, bit for bit. `diff algos
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -51,10 +48,7 @@ class Config:
     critics: int = setting(2, "M, number of critics", low=2)
     discriminator_learning_rate: float = setting(3e-4, "Adam's learning rate of the discriminator", above=0)
     discriminator_hidden: tuple[int, ...] = setting((64, 64), "hidden layers of the discriminator (tanh)", low=1)
-    uncertainty: str = setting("absolute", "ours: relative divides Unc by mean|Q1|", choices=("absolute", "relative"))
-    uncertainty_scale: float = setting(1.0, "ours: factor of the relative Unc", above=0)
     beta_max: float = setting(1.0, "ours: adaptive and learned beta stay below this", low=0, high=1, per_run=True)
-    cloning_steps: int = setting(0, "ours: updates at the start whose constraint is cloning alone", low=0)
     beta_target: float = setting(0.05, "ours: cloning error that a learned beta holds", above=0, per_run=True)
     beta_learning_rate: float = setting(3e-4, "ours: Adam's learning rate of a learned beta", above=0)
     critic_penalty: str = setting("none", "ours: cql adds its conservative penalty", choices=("none", "cql"))
@@ -70,18 +64,6 @@ class Config:
     batch_size: int = setting(256, "transitions per update", low=1)
     hidden: tuple[int, ...] = setting((256, 256), "hidden layers of actor and critics", low=1)
     normalize: bool = setting(True, "normalize observations by the dataset's mean and std + 1e-3")
-
-
-class Phase(NamedTuple):
-    """Which sort of update it is.
-
-    Attributes:
-        actor: whether the discriminator, the actor and the targets are updated too.
-        cloning: whether the constraint is cloning alone.
-    """
-
-    actor: bool
-    cloning: bool
 
 
 class BDBPlus(Algorithm[Config]):
@@ -103,10 +85,9 @@ class BDBPlus(Algorithm[Config]):
         random = {"uniform": uniform(c.penalty_actions, c.batch_size, self.action_dim)}
         return target | random if c.critic_penalty == "cql" else target
 
-    def phase(self, step: int) -> Phase:
-        """Return whether the actor is updated too, and whether its constraint is cloning alone."""
-        actor = (step + 1) % self.config.policy_freq == 0
-        return Phase(actor, actor and step < self.config.cloning_steps)
+    def phase(self, step: int) -> bool:
+        """Return whether the actor and the targets are updated too."""
+        return (step + 1) % self.config.policy_freq == 0
 
     def critic_loss(self, batch: Batch, noise: Tensor, c: Config) -> Logs:
         """Return the critics' loss."""
@@ -139,7 +120,7 @@ class BDBPlus(Algorithm[Config]):
         loss = softplus(-real).mean(-1) + softplus(fake).mean(-1)
         return {"discriminator_loss": loss, "d_real": real.sigmoid().mean(-1), "d_fake": fake.sigmoid().mean(-1)}
 
-    def actor_loss(self, batch: Batch, pi: Tensor, cloning_alone: bool, c: Config) -> Logs:
+    def actor_loss(self, batch: Batch, pi: Tensor, c: Config) -> Logs:
         """Return the actor's loss at its actions pi [runs, batch, act], eq. 17."""
         q = self.critic.frozen(batch.observations, pi, members=0)  # Q1 alone: [runs, batch]
         lambda_q = c.alpha / q.detach().abs().mean(-1) * q.mean(-1)
@@ -149,8 +130,6 @@ class BDBPlus(Algorithm[Config]):
         adaptive = (1 / unc).clamp(max=1).minimum(per_sample(c.beta_max))  # Unc = 0 gives 1
         learned = self.learned_beta.flat.detach()[0].sigmoid().minimum(per_sample(c.beta_max))
         beta = per_sample(c.beta, adaptive=adaptive, learned=learned).expand_as(unc)
-        if cloning_alone:
-            beta = torch.zeros_like(beta)
         loss = -lambda_q + (beta * adversarial + (1 - beta) * cloning).mean(-1)
         logs = {"actor_loss": loss, "lambda_q": lambda_q, "bc": cloning.mean(-1)}
         logs |= {"adversarial": adversarial.mean(-1), "uncertainty": unc.mean(-1), "beta": beta.mean(-1)}
@@ -162,8 +141,6 @@ class BDBPlus(Algorithm[Config]):
         others = self.critic.frozen(batch.observations, pi, members=slice(1, None))
         every = torch.cat([q.unsqueeze(0), others])
         unc = every.amax(0) - every.amin(0)
-        if c.uncertainty == "relative":
-            unc = c.uncertainty_scale * unc / q.abs().mean(-1, keepdim=True)
         return unc.mean(-1, keepdim=True).expand_as(unc) if c.beta_scope == "batch" else unc
 
     def beta_gradient(self, cloning: Tensor, c: Config) -> Tensor:
@@ -176,7 +153,7 @@ class BDBPlus(Algorithm[Config]):
         beta = self.learned_beta.flat.detach().sigmoid()
         return beta * (1 - beta) * error.unsqueeze(-1)
 
-    def update(self, batch: Batch, noise: Noise, phase: Phase) -> Logs:
+    def update(self, batch: Batch, noise: Noise, phase: bool) -> Logs:
         """Update the critics; in every `policy_freq`-th update the discriminator, the actor and the targets too."""
         c = self.config
         logs = self.critic_loss(batch, noise["target"], c)
@@ -185,14 +162,13 @@ class BDBPlus(Algorithm[Config]):
             logs["penalty"] = self.conservative_penalty(batch, noise["uniform"])
             loss = loss + c.penalty_weight * logs["penalty"]
         self.critic.minimize(loss)
-        if phase.actor:
+        if phase:
             pi = self.actor(batch.observations).tanh()
             logs |= self.discriminator_loss(batch, pi.detach())
             self.discriminator.minimize(logs["discriminator_loss"])
-            logs |= self.actor_loss(batch, pi, phase.cloning, c)
+            logs |= self.actor_loss(batch, pi, c)
             self.actor.minimize(logs["actor_loss"])
-            if not phase.cloning:
-                self.learned_beta.adam_step(self.beta_gradient(logs["bc"].detach(), c))
+            self.learned_beta.adam_step(self.beta_gradient(logs["bc"].detach(), c))
             self.actor_target.polyak_update(c.tau)
             self.critic_target.polyak_update(c.tau)
         return logs

@@ -141,7 +141,7 @@ class Pass:
         self.layers = [_array(layer) for layer, _ in layers_of(flat, sizes)]  # each [ensemble, runs, in + 1, out]
         # what goes into each layer, [batch, in + 1], of each perceptron
         self.into: dict[tuple[int, int], list[Array]] = {}
-        self.halves: dict[tuple[int, int, int], Bfloat16Layer] = {}  # the layers in bfloat16, of each perceptron
+        self.bfloat16_layers: dict[tuple[int, int, int], Bfloat16Layer] = {}  # of each perceptron
         outputs = _array(self.outputs)
         for member, run in itertools.product(range(ensemble), range(runs)):
             h, self.into[member, run] = x[run], [x[run]]
@@ -150,7 +150,7 @@ class Pass:
                 into = make(batch, width)
                 weight = self.layers[layer][member, run]
                 if half and min(sizes[layer], width) >= NARROW:
-                    product = self.halves[member, run, layer] = Bfloat16Layer(h, weight, into[:, :-1], keep)
+                    product = self.bfloat16_layers[member, run, layer] = Bfloat16Layer(h, weight, into[:, :-1], keep)
                     self.calls.append(product.forward)
                 else:
                     self.calls.append(partial(np.matmul, h, weight, into[:, :-1]))
@@ -195,7 +195,7 @@ class PassBack:
             g = last[member, run]
             for layer in reversed(range(len(sizes) - 1)):
                 h, weight = forward.into[member, run][layer], forward.layers[layer][member, run][:-1]
-                half = forward.halves.get((member, run, layer))
+                half = forward.bfloat16_layers.get((member, run, layer))
                 if half is not None:
                     self.calls.append(partial(half.load, torch.from_numpy(g)))
                 if of_layers is not None:

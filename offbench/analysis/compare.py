@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from offbench.analysis.methods import find_method
-from offbench.analysis.results import REFERENCES, Entry, Task, Trained, one_code, read_results, window_words
+from offbench.analysis.results import REFERENCES, Entry, Task, Trained, read_results, window_words, with_several_codes
 from offbench.analysis.statistics import Estimate, Paired, improvement, paired
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
@@ -178,16 +178,8 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
         (window_words(trained[0]), window_words(trained[1])),
         comparable(both),
         sum(t.state != "finished" for side in trained for t in side),
-        _changed([t for side in trained for t in side]),
+        tuple(with_several_codes((t.config.algorithm, t) for side in trained for t in side)),
     )
-
-
-def _changed(runs: Iterable[Trained]) -> tuple[str, ...]:
-    """Return the algorithms whose runs were trained by different code."""
-    of: dict[str, list[Trained]] = {}
-    for trained in runs:
-        of.setdefault(trained.config.algorithm, []).append(trained)
-    return tuple(name for name, same in of.items() if not one_code(same))
 
 
 Partners = Sequence[tuple[Task, Trained, Trained]]

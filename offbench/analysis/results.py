@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase as fnmatch
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -33,6 +34,7 @@ ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
 REFERENCES = {"dataset": "own reference", "d4rl": "D4RL's constants", None: "no reference: raw return"}
 
 LONG_CURVE = 40  # evaluations, of which more are drawn as means
+Key = TypeVar("Key")
 
 
 @dataclass(frozen=True)
@@ -248,17 +250,18 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
     return Results(roots, tuple(tasks), tuple(ordered), {(e.task, e.method): e for e in entries}, tuple(waiting))
 
 
-def one_code(runs: Iterable[Trained]) -> bool:
-    """Return whether the same code of the algorithm trained all runs, as far as their config.json says."""
-    return len({tuple(trained.config.code.items()) for trained in runs if trained.config.code}) < 2
+def with_several_codes(runs: Iterable[tuple[Key, Trained]]) -> list[Key]:
+    """Return the keys whose runs were trained by different code of the algorithm, as far as their config.json says."""
+    codes: dict[Key, set[tuple[tuple[str, str], ...]]] = {}
+    for key, trained in runs:
+        if trained.config.code:
+            codes.setdefault(key, set()).add(tuple(trained.config.code.items()))
+    return [key for key, found in codes.items() if len(found) > 1]
 
 
-def mixed_code(entries: Iterable[Entry]) -> set[tuple[Task, str]]:
+def mixed_code(entries: Iterable[Entry]) -> list[tuple[Task, str]]:
     """Return the tasks and algorithms whose runs, of all variants, were trained by different code."""
-    of: dict[tuple[Task, str], list[Trained]] = {}
-    for entry in entries:
-        of.setdefault((entry.task, entry.method.algorithm), []).extend(entry.runs)
-    return {key for key, runs in of.items() if not one_code(runs)}
+    return with_several_codes(((entry.task, entry.method.algorithm), run) for entry in entries for run in entry.runs)
 
 
 def window_words(runs: Iterable[Trained]) -> str:

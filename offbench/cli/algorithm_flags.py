@@ -68,8 +68,8 @@ def notices(config: type, settings: Mapping[str, object]) -> Iterator[str]:
 
 
 def moved_flag(algorithm: str, words: list[str]) -> str | None:
-    """Return the first flag that the algorithm had in earlier versions and bdb_plus has now; None if there is none."""
-    from offbench.training.registry import FORMER_SETTINGS
+    """Return the first flag that bdb had in earlier versions and bdb_plus has now; None if there is none."""
+    from offbench.training.registry import MOVED
 
-    former = {f"--{name.replace('_', '-')}" for name in FORMER_SETTINGS.get(algorithm, {})}
-    return next((flag for flag in (word.partition("=")[0] for word in words) if flag in former), None)
+    moved = {f"--{name.replace('_', '-')}" for name in (MOVED if algorithm == "bdb" else {})}
+    return next((flag for flag in (word.partition("=")[0] for word in words) if flag in moved), None)

@@ -34,8 +34,6 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "bdb fixed": ("bdb", {"beta": 0.3}),
     "bdb of the batch": ("bdb", {"beta_scope": "batch", "critics": 3, "discriminator_hidden": (8,)}),
     "bdb learned": ("bdb_plus", {"beta": "learned", "beta_learning_rate": 1e-2}),
-    "bdb relative": ("bdb_plus", {"uncertainty": "relative", "uncertainty_scale": 20.0, "beta_max": 0.7}),
-    "bdb cloning first": ("bdb_plus", {"cloning_steps": 12, "beta_max": 0.5}),
     "bdb with a penalty": ("bdb_plus", {"critic_penalty": "cql", "penalty_weight": 2.0, "penalty_actions": 3}),
     "bdb_plus": ("bdb_plus", {}),
     "cql": ("cql", {"bc_steps": 12, "num_actions": 3}),

@@ -15,6 +15,7 @@ import pytest
 
 import offbench
 from offbench.cli.main import main
+from offbench.common.errors import OffbenchError
 from offbench.common.provenance import hardware
 from offbench.rollouts.policy import load_policy
 from offbench.training.run import find_runs
@@ -63,9 +64,22 @@ def test_earlier_runs_are_reported(home: Path) -> None:
 def test_options_that_bdb_had_train_bdb_plus(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(EARLIER / "minari", home / "minari")
     words = "train bdb --dataset pendulum-small-v0 --steps 4 --eval-every 2 --eval-episodes 1 --hidden 8,8 --workers 1"
-    main([*words.split(), "--beta", "adaptive", "--uncertainty", "relative", "--beta-max=0.5"])
-    assert "--uncertainty is an option of bdb_plus, no longer of bdb" in capsys.readouterr().err
+    main([*words.split(), "--beta", "adaptive", "--beta-max=0.5", "--critic-penalty", "cql"])
+    assert "--beta-max is an option of bdb_plus, no longer of bdb" in capsys.readouterr().err
     (run,) = find_runs(home / "runs")
     config = run.config()
     assert config.algorithm == "bdb_plus"
-    assert {"beta": "adaptive", "uncertainty": "relative", "beta_max": 0.5}.items() <= config.settings.items()
+    assert {"beta": "adaptive", "critic_penalty": "cql", "beta_max": 0.5}.items() <= config.settings.items()
+
+
+def test_a_run_with_a_removed_setting_is_reported_but_not_resumed(home: Path) -> None:
+    shutil.copytree(EARLIER / "minari", home / "minari")
+    small = {"eval_every": 2, "eval_episodes": 1, "workers": 1, "hidden": (8, 8)}
+    (folder,) = offbench.train("bdb_plus", "pendulum-small-v0", steps=4, **small)
+    config = json.loads((folder / "config.json").read_text())
+    for value, why in ((10, "cloning_steps = 10, which was removed"), (0, "trained by other code of bdb_plus")):
+        config |= {"settings": config["settings"] | {"cloning_steps": value}, "code": {"bdb_plus.py": "0" * 64}}
+        (folder / "config.json").write_text(json.dumps(config))
+        assert [row["steps"] for row in offbench.normalize()] == [4]
+        with pytest.raises(OffbenchError, match=why):
+            offbench.train("bdb_plus", "pendulum-small-v0", steps=8, **small)

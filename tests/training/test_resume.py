@@ -26,7 +26,7 @@ HALF: dict[str, Any] = {"precision": "bfloat16", "hidden": (64, 64)}  # a CPU mu
 EXTRA: dict[str, dict[str, Any]] = {
     "td3_bc": {},
     "bdb": {},
-    "bdb_plus": {"critic_penalty": "cql", "penalty_actions": 3, "cloning_steps": 150, "beta": "learned"},
+    "bdb_plus": {"critic_penalty": "cql", "penalty_actions": 3, "beta": "learned"},
     "bc": {},
     "iql": {"decay_steps": 1000},
     "rebrac": {},
