@@ -34,8 +34,8 @@ _own: dict[str, type[Algorithm]] = {}  # this process's own algorithms
 
 
 NEEDED = ("batch_size", "normalize")  # settings that the training itself reads
-# Settings of earlier versions, and the values under which a run trains as without them. bdb_plus has some of bdb's now;
-# the others lowered the scores and were removed (docs/results.md).
+# Settings of earlier versions, and the values under which a run trains as without them. bdb_plus has some of bdb's
+# now; the others lowered the scores and were removed (docs/results.md).
 REMOVED: JsonObject = {"uncertainty": "absolute", "uncertainty_scale": 1.0, "cloning_steps": 0}
 MOVED: JsonObject = {
     "beta_max": 1.0,

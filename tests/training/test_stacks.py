@@ -153,7 +153,8 @@ def test_any_number_of_settings_has_a_folder(medium: str) -> None:
     settings = {"alpha": 3.0, "discount": 0.98, "tau": 0.01, "policy_noise": 0.3, "noise_clip": 0.4, "policy_freq": 3}
     settings |= {"actor_learning_rate": 0.001, "critic_learning_rate": 0.001, "normalize": False, "beta": "adaptive"}
     settings |= {"beta_scope": "batch", "critics": 3}
-    settings |= {"beta_max": 0.5, "beta_learning_rate": 0.001, "penalty_actions": 3, "critic_penalty": "cql", "penalty_weight": [2.0, 3.0]}
+    settings |= {"beta_max": 0.5, "beta_learning_rate": 0.001, "penalty_actions": 3, "critic_penalty": "cql"}
+    settings["penalty_weight"] = [2.0, 3.0]
     more: dict[str, Any] = {"steps": 2, "eval_every": 2, "eval_episodes": 1, "workers": 1, **SMALL, **settings}
     folders = offbench.train("bdb_plus", medium, **more)
     assert len(set(folders)) == 2
