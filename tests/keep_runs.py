@@ -1,7 +1,8 @@
 """Keep the plain files of finished runs: `python -m tests.keep_runs RUNS docs/results/medium/runs --steps 300000`.
 
-They are config.json, evaluations.csv and losses.csv: all that `offbench report --runs` reads. Of a run that was
-trained further than `--steps`, they are cut there: what a run does up to a step does not depend on its length.
+They are config.json, evaluations.csv, losses.csv and similarity.json, if there is one: all that `offbench report
+--runs` reads. Of a run that was trained further than `--steps`, they are cut there (and similarity.json is left out):
+what a run does up to a step does not depend on its length.
 Commands lose the folders of the machine.
 """
 
@@ -17,6 +18,7 @@ from offbench.common.files import write_json
 from offbench.training.run import Run, find_runs
 
 FILES = ("config.json", "evaluations.csv", "losses.csv")
+SIMILARITY = "similarity.json"
 
 
 def keep(runs: Path, target: Path, steps: int | None = None) -> list[Path]:
@@ -42,6 +44,8 @@ def keep(runs: Path, target: Path, steps: int | None = None) -> list[Path]:
             config["steps"] = last
             if "sessions" in config:
                 config["sessions"] = [session for session in config["sessions"] if session["step"] < last]
+        elif (run.folder / SIMILARITY).exists():
+            shutil.copyfile(run.folder / SIMILARITY, copy.folder / SIMILARITY)
         write_json(copy.config_path, config)
         copies.append(copy.folder)
     return copies
