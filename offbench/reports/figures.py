@@ -285,8 +285,11 @@ def _draw(name: str, caption: str, alt: str, paint: Callable[[Axes], None], lege
         inline = _saved(fig, "svg").decode()
         fig.patch.set_alpha(1)
         if legend:
-            fig.set_size_inches(SIZE[0], SIZE[1] + 0.2 * ((len(legend) + 1) // 2))
-            fig.legend(*_legend(legend), loc="outside lower center", ncols=2, frameon=False, fontsize="small")
+            columns = 2 if max(len(look.label) for look in legend) <= 24 else 1
+            fig.set_size_inches(SIZE[0], SIZE[1] + 0.2 * math.ceil(len(legend) / columns))
+            fig.legend(
+                *_legend(legend, 48), loc="outside lower center", ncols=columns, frameon=False, fontsize="small"
+            )
         png, svg = _saved(fig, "png"), _saved(fig, "svg")
     return Figure(name, caption, alt, png, svg, _for_page(inline, name), tuple(legend))
 
@@ -299,11 +302,11 @@ def _style(name: str) -> Any:
     return style | grid | {"axes.titlesize": 10}
 
 
-def _legend(looks: Sequence[Line]) -> tuple[list[Line2D], list[str]]:
-    """Return the lines and names of a legend."""
+def _legend(looks: Sequence[Line], most: int = 32) -> tuple[list[Line2D], list[str]]:
+    """Return the lines and names of a legend, the names shortened to `most` characters."""
     from matplotlib.lines import Line2D
 
-    names = [f" {shortened(look.label, 32)}" for look in looks]  # matplotlib hides labels that begin with _
+    names = [f" {shortened(look.label, most)}" for look in looks]  # matplotlib hides labels that begin with _
     return [Line2D([], [], color=look.color, linestyle=look.style) for look in looks], names
 
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+from matplotlib.image import imread
+
 import offbench
 from offbench.reports.figures import _tick, shortened
 from offbench.reports.markup import breakable, prose
@@ -77,3 +80,17 @@ def test_long_text_breaks_but_never_within_a_number() -> None:
         "bdb alpha=<wbr>2.5,<wbr>beta=<wbr>0.25,<wbr>hidden=<wbr>64x64"
     )
     assert prose("a < b, `offbench compare` says") == "a &lt; b, <code>offbench compare</code> says"
+
+
+@pytest.mark.parametrize(
+    "variants", [["noise_clip=0.25", "noise_clip=0.75"], [f"hidden={'8x' * n}8" for n in (1, 12, 13, 60)]]
+)
+def test_a_legend_is_within_its_picture(home: Path, variants: list[str]) -> None:
+    for variant in variants:
+        made_run(home / "runs", "hopper-medium-v0", "td3_bc", variant, 0, 50)
+    offbench.report(home / "runs", home / "out")
+    picture = imread(home / "out" / "figures" / "curves-hopper-medium-v0.png")
+    background = picture[0, 0]
+    assert not (picture == background).all()
+    for edge in (picture[:, :4], picture[:, -4:]):
+        assert (edge == background).all()
