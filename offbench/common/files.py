@@ -10,6 +10,7 @@ import io
 import json
 import os
 import re
+import shutil
 import socket
 import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -45,9 +46,10 @@ ORPHANS = 3.0  # seconds to wait for a lock: processes whose parent was killed n
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Return whether memory has run out, of this machine or of a GPU."""
-    words = ("can't allocate memory", "out of memory", "failed to map segment")  # PyTorch's, and the dynamic linker's
+    # PyTorch's and NumPy's (the last two are of sizes beyond 64 bits), and the dynamic linker's
+    words = ("can't allocate memory", "out of memory", "failed to map segment", "calculation overflowed", "is too big")
     by_number = isinstance(error, OSError) and error.errno == errno.ENOMEM
-    by_text = isinstance(error, RuntimeError | ImportError) and any(word in str(error) for word in words)
+    by_text = isinstance(error, RuntimeError | ImportError | ValueError) and any(word in str(error) for word in words)
     return isinstance(error, MemoryError) or by_number or by_text
 
 
@@ -98,7 +100,9 @@ def exclusive_lock(path: Path, what: str, timeout: float = ORPHANS) -> Iterator[
     try:
         _inodes[path] = path.stat().st_ino  # no new file gets this number while the lock is open
         with disk_errors(str(path.parent)):
-            holder.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
+            holder.unlink(missing_ok=True)
+            with open(holder, "x", encoding="utf-8") as file:  # "x" follows no link that lies there
+                file.write(f"process {os.getpid()} on {socket.gethostname()}")
         yield
     finally:
         if _holds(path):  # else the holder file belongs to another process
@@ -135,8 +139,8 @@ def check_ownership(path: Path) -> None:
 
 def _holder(path: Path) -> str:
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+        text = read_text(path)
+    except (OSError, ValueError):
         text = ""
     return text if text.startswith("process ") and len(text) < 300 else "another process"
 
@@ -180,7 +184,15 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
 def remove_leftovers(folder: Path) -> None:
     """Delete the unfinished files of killed processes in `folder`, whose lock must be held."""
     for leftover in folder.glob(".*.tmp"):
-        leftover.unlink(missing_ok=True)
+        delete(leftover)
+
+
+def delete(path: Path) -> None:
+    """Delete a file, a link (never what it leads to), or a folder with all that it holds, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def output_file(path: str | Path) -> Path:

@@ -20,6 +20,7 @@ from offbench.common.interrupts import STOPS, stops_delayed
 if TYPE_CHECKING:
     from ctypes import c_byte
 
+MOST_WORKERS = 1_000
 GRACE = 2.0  # seconds that a worker has to end when its pool closes
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -49,11 +50,11 @@ def cores() -> int:
 
 
 def default_workers(workers: int | None) -> int:
-    """Return `workers`, or one per core if it is None. Raises OffbenchError below 1."""
+    """Return `workers`, or one per core if it is None. Raises OffbenchError below 1 or above MOST_WORKERS."""
     if workers is None:
         return cores()
-    if workers < 1:
-        raise OffbenchError(f"workers must be at least 1, not {workers}")
+    if not 1 <= workers <= MOST_WORKERS:
+        raise OffbenchError(f"workers must be from 1 to {MOST_WORKERS:,}, not {workers}")
     return workers
 
 

@@ -27,6 +27,7 @@ from offbench.common.files import JsonObject, disk_errors, output_file
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.progress import Progress
 from offbench.data import minari_store
+from offbench.data.content_hash import ContentHash
 from offbench.data.file_stamps import unchanged
 from offbench.data.minari_reader import episodes_of, finite, flags, float32, open_minari, reading, shape_faults
 from offbench.envs.environments import box
@@ -83,13 +84,15 @@ def _write(dataset_id: str, path: Path, style: str, drop_timeouts: bool) -> None
         box(getattr(data, name), f"{dataset_id}: {name}")
     if not data.total_steps:
         raise OffbenchError(f"{dataset_id} has no transitions; record it again")
+    content = ContentHash()
     with Progress(int(data.total_steps), f"exporting {dataset_id}") as progress:
-        columns = _columns(data, dataset_id, progress)
+        columns = _columns(data, dataset_id, progress, content)
         if style == "d4rl":
             _write_d4rl(path, columns, _about(data, metadata))
         else:
             dropped = minari_store.provenance(metadata).timeouts == "dropped"
             _write_npz(path, (_float32(part, dataset_id) for part in columns), drop_timeouts, dropped)
+    minari_store.check_content(dataset_id, metadata, content.hexdigest())
 
 
 def _style(out: Path, style: str | None) -> str:
@@ -103,14 +106,15 @@ def _style(out: Path, style: str | None) -> str:
     return by_name
 
 
-def _columns(data: MinariDataset, dataset_id: str, progress: Progress) -> Iterator[Columns]:
-    """Yield the columns of one episode after another, checked to fit together."""
+def _columns(data: MinariDataset, dataset_id: str, progress: Progress, content: ContentHash) -> Iterator[Columns]:
+    """Yield the columns of one episode after another, checked to fit together, and add each to `content`."""
     seeds = _seed_columns(data, dataset_id)
     for e in episodes_of(data):
         for fault in shape_faults(e, data.observation_space, data.action_space):
             raise OffbenchError(f"{dataset_id}, episode {e.index}: {fault}; see `offbench verify`")
         for name in ("observations", "actions", "rewards"):
             finite(getattr(e, name), f"{dataset_id}, episode {e.index}: {name}")
+        content.add(e.observations, e.actions, e.rewards, e.terminations, e.truncations)
         yield {
             "observations": e.observations[:-1],
             "actions": e.actions,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import re
@@ -17,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 from filelock import FileLock, Timeout
 
-from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
 from offbench.common.files import ORPHANS, JsonObject, damage, disk_errors, exclusive_lock, read_json
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.settings import read_back, setting
+from offbench.data.content_hash import ContentHash
 from offbench.data.levels import parse_level, recipe_and_level
 from offbench.envs.environments import Space, parse_spec
 from offbench.envs.margin_rule import ADDED, EARLIER
@@ -200,22 +199,13 @@ def references(metadata: JsonObject) -> tuple[float, float] | None:
     return (float(low), float(high)) if low is not None and high is not None and high > low else None
 
 
-class ContentHash:
-    """SHA-256 over the arrays of episodes in order: the same for the same data, whatever file holds them."""
-
-    def __init__(self) -> None:
-        self._hash = hashlib.sha256()
-
-    def add(self, observations: Array, actions: Array, rewards: Array, ends: tuple[bool, bool]) -> None:
-        """Add one episode; dtype and shape of the arrays count too."""
-        for array in (observations, actions, rewards):
-            self._hash.update(f"{array.dtype.str}{array.shape}".encode())
-            self._hash.update(np.ascontiguousarray(array).data)
-        self._hash.update(bytes(ends))
-
-    def hexdigest(self) -> str:
-        """Return the hash of all episodes so far."""
-        return self._hash.hexdigest()
+def check_content(dataset_id: str, metadata: JsonObject, content: str) -> None:
+    """Raise OffbenchError if a dataset's content hash is not the one that its metadata record, where they do."""
+    if provenance(metadata).content_sha256 not in (None, content):
+        raise OffbenchError(
+            f"{dataset_id} is damaged: its arrays are not those of the content_sha256 in its metadata; "
+            "record or download it again"
+        )
 
 
 def being_recorded(dataset_id: str) -> bool:
@@ -365,10 +355,9 @@ def _buffers(
     for episode in episodes:
         file.check()
         observations = episode.observations.astype(dtype, copy=False)
-        ends = (episode.terminated, episode.truncated)
-        content.add(observations, episode.actions, episode.rewards, ends)
         flags = np.zeros((2, len(episode)), bool)
-        flags[:, -1] = ends
+        flags[:, -1] = episode.terminated, episode.truncated
+        content.add(observations, episode.actions, episode.rewards, *flags)
         yield EpisodeBuffer(
             id=None,
             seed=episode.seed if episode.seed >= 0 else None,

@@ -26,10 +26,11 @@ from filelock import FileLock, Timeout
 
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError
-from offbench.common.files import JsonObject, damage, disk_errors, read_text, write_json
+from offbench.common.files import JsonObject, damage, delete, disk_errors, read_json, read_text, write_json
 from offbench.common.progress import Progress
 from offbench.common.terminal import warn
 from offbench.data import minari_store
+from offbench.data.content_hash import ContentHash
 from offbench.data.file_stamps import ReplacedError, Stamps, checked, recorded, unchanged
 from offbench.data.minari_reader import check_storage, flags, float32, open_parsed, reading, shape_faults
 from offbench.data.recorded_env import evaluation_spec
@@ -146,11 +147,7 @@ def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     if cached is None:
         raise OffbenchError(f"cannot read back {folder}; delete it and try again")
     content, arrays = cached[0], dict[str, Any](cached[1])
-    if expected not in (None, content):
-        raise OffbenchError(
-            f"{dataset_id} is damaged: its arrays are not those of the content_sha256 in its metadata; "
-            "record or download it again"
-        )
+    minari_store.check_content(dataset_id, metadata, content)
     return Transitions(dataset_id, content, **arrays, low=action_space.low, high=action_space.high, metadata=metadata)
 
 
@@ -205,13 +202,12 @@ def _convert(
     """Read every episode once and write the arrays beside `folder`, meta.json last; return where they are."""
     check_storage(dataset_id)
     columns: dict[str, list[Array]] = {name: [] for name in ("observations", "actions", "rewards", "masks")}
-    content, lengths, returns = minari_store.ContentHash(), [], []
+    content, lengths, returns = ContentHash(), [], []
     with Progress(int(data.total_steps), f"converting {dataset_id}") as progress:
         for episode in _episodes(data, dataset_id):
             flat = _episode_arrays(episode, observations, actions, f"{dataset_id}, episode {episode.id}")
-            flags = bool(episode.terminations[-1]), bool(episode.truncations[-1])
             observed, acted, earned = map(np.asarray, (episode.observations, episode.actions, episode.rewards))
-            content.add(observed, acted, earned, flags)
+            content.add(observed, acted, earned, episode.terminations, episode.truncations)
             for name, array in flat.items():
                 columns[name].append(array)
             lengths.append(len(flat["rewards"]))
@@ -240,7 +236,7 @@ def _convert(
             files[f"{name}.npy"] = recorded(aside / f"{name}.npy")
         meta = {"source": source, "content_sha256": content.hexdigest(), "files": files}
         write_json(aside / "meta.json", meta)
-        shutil.rmtree(folder, ignore_errors=True)
+        delete(folder)
     except BaseException:
         shutil.rmtree(aside, ignore_errors=True)
         raise
@@ -250,12 +246,9 @@ def _convert(
 def _forget(source: str) -> None:
     """Delete what was converted from an earlier content of the same dataset."""
     for meta in cache().glob("*/meta.json"):
-        try:
-            superseded = json.loads(read_text(meta)).get("source") == source
-        except (OSError, ValueError, AttributeError):
-            continue
-        if superseded:
-            shutil.rmtree(meta.parent, ignore_errors=True)
+        with contextlib.suppress(OffbenchError):  # of another dataset, and damaged
+            if read_json(meta).get("source") == source:
+                shutil.rmtree(meta.parent, ignore_errors=True)
 
 
 def _remove_leftovers(folder: Path) -> None:
@@ -263,7 +256,7 @@ def _remove_leftovers(folder: Path) -> None:
     for aside in folder.parent.glob(".*"):
         key = aside.name[1:].partition(".")[0]
         if key == folder.name:
-            shutil.rmtree(aside, ignore_errors=True)
+            delete(aside)
         elif len(key) == len(folder.name) and aside.is_dir():
             with contextlib.suppress(Timeout, OSError), FileLock(aside.with_name(f"{key}.lock"), timeout=0):
                 shutil.rmtree(aside, ignore_errors=True)

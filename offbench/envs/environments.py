@@ -171,6 +171,8 @@ def make_env(spec: str, render_mode: str | None = None) -> Env:
     plain, rule = without_margin(spec)
     made = EnvSpec.from_json(plain)
     made.disable_env_checker = True
+    if made.kwargs.get("render_mode") == "human":  # of whoever recorded the data; it would open a window
+        del made.kwargs["render_mode"]
     with _quiet_loading(made.id):
         env: Env = gym.make(made, render_mode=render_mode) if render_mode else gym.make(made)  # with the EnvSpec's own
     if hasattr(env.unwrapped, "model"):

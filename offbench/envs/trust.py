@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.metadata
+import importlib.util
 import os
 import re
+import sys
 from collections.abc import Iterator
 
 import gymnasium as gym
@@ -22,6 +25,7 @@ VARIABLE = "OFFBENCH_TRUST"
 REMEDY = f"if you trust where it is from, add --trust ({VARIABLE}=1 in Python)"
 # whose environments may be made, registered or not; imported D4RL files name gym's
 PACKAGES = ("gymnasium.envs.", "gymnasium_robotics.envs.", "gym.envs.")
+DISTRIBUTIONS = {"gymnasium": "gymnasium", "gymnasium_robotics": "gymnasium-robotics", "gym": "gym"}
 # of gymnasium.wrappers: those for flat spaces that write no file, open no window and take no function
 WRAPPERS = {
     "ClipAction",
@@ -92,11 +96,32 @@ def _check_class(entry_point: object, base: type) -> None:
         raise OffbenchError(
             f"it would run {entry_point}, which is not among the {kind} that a file may name; {REMEDY}"
         )
+    if not is_trusting():
+        _check_installed(names[1])
     cls = getattr(importlib.import_module(names[1]), names[2], None)
     if not (isinstance(cls, type) and issubclass(cls, base)):
         raise OffbenchError(
             f"its entry point {entry_point!r} is not a class derived from {base.__name__}, so it is not run"
         )
+
+
+def _check_installed(module: str) -> None:
+    """Check that Python would import an allowed package as it was installed, and not a folder of the same name.
+
+    Raises:
+        OffbenchError: the package is not installed, or another folder hides it, such as one in the working directory.
+    """
+    package = module.partition(".")[0]
+    if package in sys.modules or package not in DISTRIBUTIONS:
+        return
+    try:
+        installed = importlib.metadata.distribution(DISTRIBUTIONS[package]).locate_file(package)
+    except importlib.metadata.PackageNotFoundError:
+        raise OffbenchError(f"it needs {module}; install the package {DISTRIBUTIONS[package]}") from None
+    found = importlib.util.find_spec(package)
+    folders = [os.path.realpath(path) for path in (found.submodule_search_locations or [])] if found else []
+    if os.path.realpath(str(installed)) not in folders:
+        raise OffbenchError(f"it would run {module} from {', '.join(folders)}, not as installed; {REMEDY}")
 
 
 def _is_allowed(module: str, name: str, base: type) -> bool:

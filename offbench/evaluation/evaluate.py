@@ -19,7 +19,8 @@ from offbench.envs.environments import checked_spec, env_spec, same_environment
 from offbench.envs.margin_rule import ADDED, SINCE, without_margin
 from offbench.envs.recipes import d4rl_reference, load_recipe
 from offbench.envs.trust import REMEDY, is_trusting
-from offbench.rollouts.policy import Policy, load_policy
+from offbench.evaluation.policies import load_policy
+from offbench.rollouts.policy import Policy
 from offbench.rollouts.rollouts import Rollouts, gathered
 from offbench.training.run import Run, RunConfig
 
@@ -120,13 +121,8 @@ def open_policy(path: Path, env: str | None = None) -> tuple[Policy, RunConfig |
     """
     config = None
     if path.is_dir():
-        run = Run(path)
-        config = run.config()
-        if not run.policy_path.exists():
-            raise OffbenchError(f"{path} has no policy yet; train the run to its first checkpoint")
-        policy = load_policy(run.policy_path)
-    else:
-        policy = load_policy(path)
+        config = Run(path).config()
+    policy = load_policy(path)
     if env is not None:
         text = load_recipe(env).env_spec()
     elif config is not None and config.env_spec is not None:

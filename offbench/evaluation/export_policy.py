@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import output_file, write_bytes
-from offbench.rollouts.policy import Policy, load_policy
-from offbench.training.run import Run
+from offbench.evaluation.policies import load_policy
+from offbench.rollouts.policy import Policy
 
 TORCHSCRIPT, ONNX = (".pt", ".pth", ".ts"), ".onnx"
 ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
@@ -78,7 +78,7 @@ def export_policy(path: str | Path, out: str | Path) -> Path:
         raise OffbenchError(
             f"cannot write {target.name!r}: policies become TorchScript or ONNX; give --out FILE.pt or FILE.onnx"
         )
-    policy = load_policy(Run(source).policy_path if source.is_dir() else source)
+    policy = load_policy(source)
     if policy.kind not in ("tanh", "squashed_gaussian", "gaussian"):
         reason = "chooses among random actions" if policy.kind == "best_by_q" else "is random"
         raise OffbenchError(f"{path} {reason} ({policy.kind}); only policies with one best action can be exported")

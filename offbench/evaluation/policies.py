@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from offbench.common.errors import OffbenchError
+from offbench.common.text import printable
 from offbench.rollouts.policy import Policy
 from offbench.rollouts.policy import load_policy as read_policy
 from offbench.training.run import Run
@@ -16,10 +18,21 @@ def load_policy(path: str | Path) -> Policy:
         action = policy(observation)
 
     Raises:
-        OffbenchError: no policy there, or a damaged one.
+        OffbenchError: no policy there, a damaged one, or that of another run.
     """
     path = Path(path)
-    if path.is_dir():
-        Run(path).config()  # raises if the folder is no run
-        return read_policy(Run(path).policy_path)
-    return read_policy(path)
+    if not path.is_dir():
+        return read_policy(path)
+    run = Run(path)
+    config = run.config()
+    if not run.policy_path.exists():
+        raise OffbenchError(f"{path} has no policy yet; train the run to its first checkpoint")
+    policy = read_policy(run.policy_path)
+    for key in ("algorithm", "seed", "dataset_sha256"):
+        found = policy.origin.get(key, getattr(config, key))
+        if found != getattr(config, key):
+            raise OffbenchError(
+                f"{run.policy_path} is of another run: its {key} is {printable(str(found))}; put the run's own back, "
+                "or delete it: the next training writes it again"
+            )
+    return policy

@@ -16,7 +16,6 @@ import csv
 import dataclasses
 import json
 import os
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +25,7 @@ from offbench.common.files import (
     JsonObject,
     csv_bytes,
     damage,
+    delete,
     exclusive_lock,
     read_json,
     regular,
@@ -233,12 +233,8 @@ class Run:
         if self.config_path.exists():
             with self.locked():
                 for path in self.folder.iterdir():
-                    if path.name == ".lock":
-                        continue
-                    if path.is_dir() and not path.is_symlink():
-                        shutil.rmtree(path)
-                    else:
-                        path.unlink()
+                    if path.name != ".lock":
+                        delete(path)
 
     def begin(self, step: int, steps: int, made: MadeWith) -> None:
         """Note in config.json that the run is trained from `step` to `steps`, and with what, if that has changed.

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from offbench.algorithm.interface import Algorithm, PolicyParts, stack_configs
 from offbench.common.errors import OffbenchError
+from offbench.common.files import JsonObject
 from offbench.data.transitions import Transitions
 from offbench.rollouts.policy import Policy, check_networks
 from offbench.training.batches import CHUNK, Store, draw_chunk
@@ -58,17 +59,10 @@ class Stack:
 
     def policy(self, run: int) -> Policy:
         """Return one run's policy as it is now, for the NumPy rollouts and the policy file."""
-        spec, data = self.specs[run], self.data[run]
+        data = self.data[run]
         parts = self.algorithm.policy(run)
         mean, std = self.store.normalizers[run]
         actor, critic = (tuple((w.numpy(), b.numpy()) for w, b in p) for p in (parts.layers, parts.critic))
-        origin = {
-            "algorithm": spec.algorithm,
-            "step": self.step,
-            "seed": spec.seed,
-            "dataset": data.dataset_id,
-            "dataset_sha256": data.content,
-        }
         return Policy(
             parts.kind,
             actor,
@@ -77,11 +71,21 @@ class Stack:
             data.low,
             data.high,
             data.env_id,
-            origin,
+            {"step": self.step, **self.origin(run)},
             critic=critic,
             samples=parts.samples,
             activation=parts.activation,
         )
+
+    def origin(self, run: int) -> JsonObject:
+        """Return which run it is, for its policy and checkpoints."""
+        spec, data = self.specs[run], self.data[run]
+        return {
+            "algorithm": spec.algorithm,
+            "seed": spec.seed,
+            "dataset": data.dataset_id,
+            "dataset_sha256": data.content,
+        }
 
     def tensors(self) -> dict[str, Tensor]:
         """Return everything learned; runs are axis 1 (a step count has none)."""
@@ -95,8 +99,14 @@ class Stack:
         """Return what one run's checkpoint keeps: its slice of everything learned."""
         return slice_of(self.tensors(), run)
 
-    def load(self, run: int, tensors: Mapping[str, Tensor]) -> None:
-        """Put one run's checkpoint back. Raises OffbenchError if it does not fit."""
+    def load(self, run: int, tensors: Mapping[str, Tensor], state: JsonObject) -> None:
+        """Put one run's checkpoint back. Raises OffbenchError if it does not fit, or is of another run."""
+        origin = self.origin(run)
+        if state.get("origin", origin) != origin:  # earlier versions wrote none
+            raise OffbenchError(
+                f"the checkpoint in {self.specs[run].folder} is of another run: {state['origin']}; put the run's own "
+                "back, or delete the run to repeat it"
+            )
         for name, tensor in self.run_tensors(run).items():
             saved = tensors.get(name)
             if saved is None or saved.shape != tensor.shape:

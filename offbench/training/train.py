@@ -229,6 +229,6 @@ def restore(run: Run, algorithm: str | type | None = None) -> Stack:
     times = config.steps, config.eval_every, config.eval_episodes
     spec = RunSpec(config.algorithm, settings, config.dataset, config.seed, *times, run.folder)
     stack = Stack(kind, [spec], {config.dataset: data}, "cpu")
-    stack.load(0, tensors)
+    stack.load(0, tensors, state)
     stack.step = int(state["step"])
     return stack

@@ -150,7 +150,7 @@ class Trainer:
             loaded = [checkpoints.load_checkpoint(run.folder, step) for run in self.runs]
             if all(loaded):
                 for i, (tensors, state) in enumerate(checkpoint for checkpoint in loaded if checkpoint):
-                    self.stack.load(i, tensors)
+                    self.stack.load(i, tensors, state)
                     self.stack.program.resume_logging(i, state.get("unlogged", []))
                 self.stack.step = step
                 break
@@ -177,7 +177,7 @@ class Trainer:
                 run.write_evaluations(self.evaluations[i])
                 run.write_losses(self.losses[i])
                 self.stack.policy(i).save(run.policy_path)
-                state: JsonObject = {"step": step}
+                state: JsonObject = {"step": step, "origin": self.stack.origin(i)}
                 unlogged = self.stack.program.unlogged(i)
                 if unlogged:  # stopped by the clock, between two rows of losses.csv
                     state["unlogged"] = unlogged

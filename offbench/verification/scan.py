@@ -11,8 +11,8 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.progress import Progress
+from offbench.data.content_hash import ContentHash
 from offbench.data.minari_reader import Recorded, episodes_of, shape_faults
-from offbench.data.minari_store import ContentHash
 from offbench.verification.findings import Findings
 
 if TYPE_CHECKING:
@@ -55,7 +55,9 @@ def scan(data: MinariDataset, limit: int | None, findings: Findings) -> Survey:
             result.sound.append(sound)
             result.returns.append(float(np.sum(episode.rewards, dtype=np.float64)) if numeric else float("nan"))
             if numeric:
-                result.content.add(episode.observations, episode.actions, episode.rewards, result.ended[-1])
+                fit = episode.terminations.shape == episode.truncations.shape and episode.terminations.size
+                flags = episode.arrays[3:] if fit else [[end] for end in ends]
+                result.content.add(episode.observations, episode.actions, episode.rewards, *flags)
                 twins.add(episode, findings)
             else:
                 findings.add("dtype", where, "not numbers")

@@ -17,6 +17,7 @@ from offbench.agents.ladder import read_ladder
 from offbench.common.errors import OffbenchError
 from offbench.common.files import exclusive_lock
 from offbench.data import minari_store
+from offbench.data.content_hash import ContentHash
 from offbench.data.levels import LEVELS
 
 with warnings.catch_warnings():
@@ -93,10 +94,9 @@ def test_provenance_says_what_was_measured(recorded: Any) -> None:
 
 def test_the_content_hash_is_over_the_arrays(medium: str) -> None:
     """Recomputed here from Minari's own reading, and blind to how the file is laid out."""
-    content = minari_store.ContentHash()
+    content = ContentHash()
     for episode in minari.load_dataset(medium).iterate_episodes():
-        ends = bool(episode.terminations[-1]), bool(episode.truncations[-1])
-        content.add(episode.observations, episode.actions, episode.rewards, ends)
+        content.add(episode.observations, episode.actions, episode.rewards, episode.terminations, episode.truncations)
     assert content.hexdigest() == minari_store.provenance(minari_store.read_metadata(medium)).content_sha256
     assert content.hexdigest() == offbench.load(medium).content
 
@@ -169,7 +169,7 @@ def test_a_failed_recording_leaves_the_old_dataset(tiny: tuple[str, str], monkey
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(minari_store.ContentHash, "add", fail)
+    monkeypatch.setattr(ContentHash, "add", fail)
     with pytest.raises(OffbenchError, match="No space left on device"):
         offbench.collect(recipe, "random", behaviour_dir=behaviour_dir, workers=1, steps=60, overwrite=True)
     assert json.dumps(minari_store.read_metadata(name)) == before

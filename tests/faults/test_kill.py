@@ -21,6 +21,7 @@ import offbench
 from offbench.analysis.normalize import score_runs
 from offbench.common import checkpoints
 from offbench.data import minari_store
+from offbench.data.content_hash import ContentHash
 from offbench.data.export import export
 from offbench.data.minari_reader import episodes_of, open_minari
 from offbench.rollouts.policy import load_policy
@@ -78,9 +79,9 @@ def warm() -> Iterator[Warm]:
 
 def whole(name: str) -> str:
     """Read a visible dataset to its end; return its content hash, which is the recorded one."""
-    content = minari_store.ContentHash()
+    content = ContentHash()
     for e in episodes_of(open_minari(name)):
-        content.add(e.observations, e.actions, e.rewards, (bool(e.terminations[-1]), bool(e.truncations[-1])))
+        content.add(e.observations, e.actions, e.rewards, e.terminations, e.truncations)
     assert content.hexdigest() == minari_store.provenance(minari_store.read_metadata(name)).content_sha256
     return content.hexdigest()
 

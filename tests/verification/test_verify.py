@@ -14,6 +14,7 @@ import pytest
 import offbench
 from offbench.cli.main import main
 from offbench.data import minari_store
+from offbench.data.content_hash import ContentHash
 from offbench.data.levels import LEVELS
 from offbench.data.minari_reader import episodes_of, open_minari
 from offbench.envs.environments import env_spec
@@ -48,9 +49,9 @@ def tamper(name: str, edit: Edit) -> str:
     with h5py.File(minari_store.path_of(name) / "data" / "main_data.hdf5", "a") as file:
         edit(file)
         change_metadata(name, total_episodes=len(file))
-    content, steps = minari_store.ContentHash(), 0
+    content, steps = ContentHash(), 0
     for e in episodes_of(open_minari(name)):
-        content.add(e.observations, e.actions, e.rewards, (bool(e.terminations[-1]), bool(e.truncations[-1])))
+        content.add(e.observations, e.actions, e.rewards, e.terminations, e.truncations)
         steps += len(e)
     change_metadata(name, content_sha256=content.hexdigest(), total_steps=steps)
     return name
