@@ -18,7 +18,7 @@ import numpy as np
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, damage, read_json, regular
-from offbench.common.scores import normalize
+from offbench.common.scores import LARGEST, are_references, normalize
 from offbench.common.settings import read_back
 from offbench.common.terminal import inform, warn
 from offbench.envs.environments import same_environment
@@ -148,8 +148,10 @@ def read_ladder(folder: Path) -> Ladder | None:
             rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
         ladder = Ladder(folder, info, rungs)
         numbers = [info.references[name][key] for name in ("random", "expert") for key in REFERENCE]
-        if not np.isfinite(numbers).all() or not ladder.random_return < ladder.expert_return:
-            raise ValueError("its references are not finite, or out of order")
+        if not all(abs(number) < LARGEST for number in numbers):
+            raise ValueError("its references are not finite, or absurd")
+        if not are_references(ladder.random_return, ladder.expert_return):
+            raise ValueError("its references are equal, or out of order")
         if not (info.levels["medium"] and ladder.role("medium") and ladder.role("expert")):
             raise ValueError("it has no medium policy, or no expert")
         if gone := [rung.policy for rung in rungs if not (folder / "policies" / rung.policy).is_file()]:

@@ -98,11 +98,10 @@ def name_methods(configs: Mapping[tuple[str, str], Sequence[RunConfig]]) -> dict
         shared = {part for part in set.intersection(*siblings) if "=" in part}
         shared = {part for part in shared if part.partition("=")[0] not in {*OURS, "beta"}}
         names[key] = labels[key] or method.named(shared)
-    taken = Counter(name for name, _ in {(names[key], method) for key, method in plain.items()})
-    return {
-        key: dataclasses.replace(method, name=names[key] if taken[names[key]] == 1 else method.named())
-        for key, method in plain.items()
-    }
+    for longer in (Method.named, lambda method: f"{method.algorithm}/{method.variant}"):
+        taken = Counter(name for name, _ in {(names[key], method) for key, method in plain.items()})
+        names = {key: names[key] if taken[names[key]] == 1 else longer(method) for key, method in plain.items()}
+    return {key: dataclasses.replace(method, name=names[key]) for key, method in plain.items()}
 
 
 def _label(runs: Sequence[RunConfig]) -> str:
@@ -150,7 +149,7 @@ def find_method(methods: Sequence[Method], name: str) -> Method:
 
 def _beta(value: object) -> str | None:
     if isinstance(value, int | float) and abs(value) < 1e6:
-        return f"{value:.2f}"
+        return text if float(text := f"{value:.2f}") == value else f"{value:g}"
     return None if value is None else str(value)  # what a damaged config.json or another's algorithm has there
 
 

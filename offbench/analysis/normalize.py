@@ -11,8 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
-import numpy as np
-
 from offbench.agents.ladder import BEHAVIOUR, folder_of, read_ladder
 from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import Entry, entries_of, mixed_code, read_results
@@ -20,7 +18,7 @@ from offbench.analysis.statistics import iqm
 from offbench.common import scores
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, csv_bytes
-from offbench.common.tables import latex, markdown, tabular
+from offbench.common.tables import latex, markdown, plain, tabular
 from offbench.common.text import aligned, compact, no_formula
 from offbench.envs.recipes import load_recipe
 from offbench.training.run import DIGITS, Run, find_runs
@@ -99,8 +97,8 @@ def score_returns(env: str, returns: Sequence[float]) -> list[Row]:
         OffbenchError: unknown environment, a return that is not finite, or no reference at all.
     """
     recipe = load_recipe(env)
-    if not np.isfinite(returns).all():
-        raise OffbenchError(f"returns must be finite numbers, not {list(returns)}")
+    if not all(abs(value) < scores.LARGEST for value in returns):
+        raise OffbenchError(f"returns must be finite numbers below {scores.LARGEST:g}, not {list(returns)}")
     shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder else None
     ladder = shipped or read_ladder(folder_of(recipe, 0, BEHAVIOUR) / "ladder")
     ours = (ladder.random_return, ladder.expert_return) if ladder and ladder.check(recipe) else None
@@ -163,10 +161,14 @@ def render(rows: Sequence[Row], style: str = "table") -> str:
     header = [TITLES.get(key, key) or key for key in keys]
     cells = [[_cell(row, key) for key in keys] for row in rows]
     if style == "markdown":
-        return "\n".join([*markdown(header, cells), *(line for note in notes(rows) for line in ("", f"note: {note}"))])
+        header, *cells = [[plain(text) for text in line] for line in [header, *cells]]
+        return "\n".join(
+            [*markdown(header, cells), *(line for note in notes(rows) for line in ("", f"note: {plain(note)}"))]
+        )
     if style == "latex":
         header, *cells = [[latex(text) for text in line] for line in [header, *cells]]
-        return "\n".join([*tabular(header, cells, len(header)), *(f"% note: {note}" for note in notes(rows))])
+        comments = (f"% note: {' '.join(note.split())}" for note in notes(rows))
+        return "\n".join([*tabular(header, cells, len(header)), *comments])
     lines = aligned(header, cells, sum(key in NAMES for key in keys))
     return "\n".join([*lines, *(f"note: {note}" for note in notes(rows))])
 

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 Evaluations = Mapping[int, Sequence[tuple[float, int]]]  # {step: [(return, length) of each episode]}
+LARGEST = 1e15  # what no step, return or reference reaches: scores and their squares stay finite
+SMALLEST_GAP = 1e-12  # between the references of a score
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
@@ -22,6 +24,11 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
         return mean, mean, mean
     half = float(stats.t.ppf(0.975, len(data) - 1) * data.std(ddof=1) / np.sqrt(len(data)))
     return mean, mean - half, mean + half
+
+
+def are_references(low: float, high: float) -> bool:
+    """Return whether returns can be normalized by these two: finite, and the expert's above the random policy's."""
+    return max(abs(low), abs(high)) < LARGEST and high - low >= SMALLEST_GAP
 
 
 def normalize(value: float, low: float, high: float) -> float:

@@ -75,7 +75,8 @@ class Table:
 
     def csv(self) -> bytes:
         """Return the table as CSV, text as shown."""
-        return csv_bytes(self.columns(), [[no_formula(cell.full) for cell in row] for row in self.rows])
+        header = [str(no_formula(text)) for text in self.columns()]
+        return csv_bytes(header, [[no_formula(cell.full) for cell in row] for row in self.rows])
 
     def markdown(self) -> str:
         """Return title, table and notes as Markdown; the best in bold."""

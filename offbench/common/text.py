@@ -59,8 +59,10 @@ def compact(number: int) -> str:
     return f"{number:,}"
 
 
-# control characters but tab and line feed, and those that turn the direction of text
-_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+# control characters but tab and line feed, those that turn the direction of text, break lines or cannot be seen
+_CONTROLS = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u2069\ufeff\U000e0000-\U000e007f]"
+)
 
 
 def printable(text: str) -> str:
@@ -70,7 +72,7 @@ def printable(text: str) -> str:
 
 def no_formula(cell: object) -> object:
     """Return a CSV cell that no spreadsheet takes for a formula: such text gets an apostrophe in front."""
-    if not (isinstance(cell, str) and cell[1:] and cell[0] in "=+-@\t\r"):
+    if not (isinstance(cell, str) and cell[1:] and (cell[0] in "\t\r" or cell.lstrip()[:1] in tuple("=+-@"))):
         return cell
     try:
         float(cell)

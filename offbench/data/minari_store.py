@@ -19,6 +19,7 @@ from filelock import FileLock, Timeout
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
 from offbench.common.files import ORPHANS, JsonObject, damage, disk_errors, exclusive_lock, read_json
 from offbench.common.hdf5_file import SafeFile, safe_file
+from offbench.common.scores import are_references
 from offbench.common.settings import read_back, setting
 from offbench.data.content_hash import ContentHash
 from offbench.data.levels import parse_level, recipe_and_level
@@ -196,7 +197,7 @@ def provenance(metadata: JsonObject) -> Provenance:
 def references(metadata: JsonObject) -> tuple[float, float] | None:
     """Return a dataset's own reference returns (random, expert); None if it has none to normalize by."""
     low, high = metadata.get("ref_min_score"), metadata.get("ref_max_score")
-    return (float(low), float(high)) if low is not None and high is not None and high > low else None
+    return (float(low), float(high)) if low is not None and high is not None and are_references(low, high) else None
 
 
 def check_content(dataset_id: str, metadata: JsonObject, content: str) -> None:

@@ -52,7 +52,8 @@ class Summary:
         told["imported from"] = ours.imported.get("file")
         told["versions"] = ", ".join(f"{name} {version}" for name, version in ours.versions.items()) or None
         shown = [f"{key:<15} {fact(value)}" for key, value in told.items() if value is not None]
-        return lines + (shown or ["not recorded by offbench"])
+        lines += shown or ["not recorded by offbench"]
+        return [" ".join(line.splitlines()) for line in lines]  # a line break in a text would begin a line of its own
 
     def __repr__(self) -> str:
         """Return id and size, and how to see more."""

@@ -19,6 +19,7 @@ from typing import TypeVar
 
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import damage, read_text
+from offbench.common.scores import are_references
 from offbench.common.settings import build, setting
 from offbench.envs.environments import env_spec
 from offbench.envs.margin_rule import ADDED, EARLIER, with_margin
@@ -160,6 +161,9 @@ def _check(recipe: Recipe, where: str) -> None:
         raise OffbenchError(f"{where}: name may hold letters, digits, - and _ only, not {recipe.name!r}")
     if (recipe.d4rl_min is None) != (recipe.d4rl_max is None):
         raise OffbenchError(f"{where}: give both d4rl_min and d4rl_max, or neither")
+    low, high = recipe.d4rl_min, recipe.d4rl_max
+    if low is not None and high is not None and not are_references(low, high):
+        raise OffbenchError(f"{where}: d4rl_min and d4rl_max must be returns in this order, not {low}, {high}")
     sac = recipe.sac
     if not sac.cycle()[1]:
         raise OffbenchError(f"{where}: [sac] gradient_steps x envs must be at least 1/64")

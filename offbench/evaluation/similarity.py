@@ -10,6 +10,7 @@ Q-value". offbench computes two readings of it:
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import numpy as np
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import read_json, write_json
+from offbench.common.scores import LARGEST
 from offbench.common.seeds import Purpose, check_seed, generator
 from offbench.common.settings import read_back
 from offbench.training.run import Run
@@ -38,6 +40,14 @@ class Similarity:
     tolerance: float
     action_similar: float
     action_tolerance: float
+
+    def __post_init__(self) -> None:
+        """Raise OffbenchError for numbers that no evaluation has."""
+        percents, tolerances = (self.q_similar, self.action_similar), (self.tolerance, self.action_tolerance)
+        if self.step < 0 or self.samples < 1 or not all(0 <= percent <= 100 for percent in percents):
+            raise OffbenchError("step, samples or a percentage is out of range")
+        if not all(0 <= tolerance < LARGEST for tolerance in tolerances):
+            raise OffbenchError("a tolerance is out of range")
 
 
 def similarity(
@@ -99,7 +109,7 @@ def read_similarity(run: Run) -> Similarity | None:
     path = _file(run)
     if not path.exists():
         return None
-    remedy = f"write it again with `offbench evaluate {run.folder} --similarity`"
+    remedy = f"write it again with `offbench evaluate {shlex.quote(str(run.folder))} --similarity`"
     return read_back(Similarity, read_json(path, remedy), path, remedy)
 
 

@@ -49,7 +49,9 @@ def page(title: str, lead: Markup, sections: Sequence[Section], boxes: Sequence[
         *boxes,
         tag("script", Markup(script)),
     ]
-    return ("<!DOCTYPE html>\n" + tag("html", head, "\n", tag("body", *body), lang="en") + "\n").encode()
+    return ("<!DOCTYPE html>\n" + tag("html", head, "\n", tag("body", *body), lang="en") + "\n").encode(
+        errors="backslashreplace"
+    )
 
 
 def _asset(name: str) -> str:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import itertools
 import json
 import os
 from collections.abc import Iterator
@@ -34,7 +35,7 @@ from offbench.common.files import (
     write_json,
 )
 from offbench.common.provenance import Hardware, MadeWith
-from offbench.common.scores import Evaluations
+from offbench.common.scores import LARGEST, Evaluations, are_references
 from offbench.common.settings import read_back
 from offbench.training.registry import current_settings
 from offbench.training.source_code import changes
@@ -44,8 +45,6 @@ FORMAT = "offbench-run-1"
 REPEAT = "delete the run to repeat it"
 TRAIN_ANEW = "delete that run (`train` does with --fresh) or give another --runs"
 DIGITS = 8  # of a content hash, where a table must tell two contents of one dataset id apart
-LARGEST = 1e15  # what no step, return or reference reaches: scores and their squares stay finite
-SMALLEST_GAP = 1e-12  # between the references of a score
 MUST_MATCH = ("algorithm", "settings", "dataset", "dataset_sha256", "seed", "eval_every", "eval_episodes")
 
 
@@ -102,6 +101,11 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         """Raise OffbenchError for numbers that no run has."""
+        if self.format != FORMAT:
+            raise OffbenchError(f"format is {self.format[:40]!r}, not {FORMAT}: another version of offbench wrote it")
+        for name in ("algorithm", "variant", "dataset", "label"):
+            if len(getattr(self, name).splitlines()) > 1:
+                raise OffbenchError(f"{name} has several lines, which would be rows of their own in tables")
         if self.seed < 0 or not 0 <= self.steps < LARGEST:
             raise OffbenchError(f"seed {self.seed} or steps {self.steps} is out of range")
         if self.env_spec is not None:
@@ -114,7 +118,7 @@ class RunConfig:
         for name, pair in self.references.items():
             if name not in ("dataset", "d4rl"):
                 raise OffbenchError(f"unknown references {name!r}")
-            if pair and not (max(map(abs, pair)) < LARGEST and pair[1] - pair[0] >= SMALLEST_GAP):
+            if pair and not are_references(*pair):
                 raise OffbenchError(f"the references ({name}) are {pair[0]} and {pair[1]}")
 
     @property
@@ -298,7 +302,7 @@ class Run:
                 for row in reader:
                     if None in row or None in row.values():
                         raise ValueError(f"line {reader.line_num} does not have {len(EVALUATION_COLUMNS)} cells")
-                    value, step = float(row["return"]), _count(row["step"])
+                    value, step = _number(row["return"]), _count(row["step"])
                     if not abs(value) < LARGEST:
                         raise ValueError(f"a return is {value}")
                     if step > last:
@@ -336,7 +340,18 @@ class Run:
             damage(str(path), "is damaged", REPEAT),
             open(path, newline="", encoding="utf-8", opener=regular) as file,
         ):
-            return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
+            rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
+            steps = [row["step"] for row in rows if "step" in row]
+            if not all(low < high for low, high in itertools.pairwise([-1.0, *steps, LARGEST])):
+                raise ValueError("its steps are out of order or out of range")
+            return rows
+
+
+def _number(text: str) -> float:
+    """Return a number as offbench writes it; `float` takes `1_000`, spaces and digits of other scripts, too."""
+    if "_" in text or not text.isascii() or text != text.strip():
+        raise ValueError(f"{text[:40]!r} is not a return")
+    return float(text)
 
 
 def _count(text: str) -> int:
@@ -372,4 +387,4 @@ def _is_run(path: Path) -> bool:
         config = read_json(path, REPEAT)
     except OffbenchError:
         return path.parent.name.startswith("seed-")
-    return config.get("format") == FORMAT
+    return config.get("format") == FORMAT or path.parent.name.startswith("seed-")

@@ -244,7 +244,8 @@ def variant(config: DataclassInstance, precision: str = "float32") -> str:
 
 def _setting_text(value: object) -> str:
     if isinstance(value, tuple):
-        return "x".join(str(item) for item in value)
+        texts = (_setting_text(item).replace("x", "%78") if isinstance(item, str) else str(item) for item in value)
+        return "x".join(texts)
     if isinstance(value, float):
         return short if float(short := f"{value:g}") == value else repr(value)
     return quote(value, safe="") if isinstance(value, str) else str(value).lower()

@@ -54,6 +54,16 @@ def test_a_label_is_the_name_unless_two_methods_have_it() -> None:
     assert (one.label, other.label) == ("cql (bc_steps=1)", "td3_bc")
 
 
+def test_a_label_that_is_the_name_of_another_method() -> None:
+    variants = (("bc", "hidden=8x8", None), ("bc", "hidden=8x9", None), ("bc", "hidden=8x10", None))
+    assert len({method.label for method in named(*variants, labels=("x", "x", "bc (hidden=8x8)"))}) == 3
+
+
+def test_a_beta_that_rounds_to_the_papers_is_not_the_papers() -> None:
+    published = [method.published for method in named(("bdb", "beta=0.25", 0.25), ("bdb", "beta=0.2512", 0.2512))]
+    assert published == ["bdb beta=0.25", "bdb beta=0.2512"]
+
+
 def test_variants_with_one_label_on_other_datasets_are_one_method() -> None:
     common: dict[str, Any] = {"algorithm": "rebrac", "dataset_sha256": "", "seed": 0, "steps": 1, "references": {}}
 

@@ -166,7 +166,7 @@ CASES: dict[str, tuple[str, str]] = {
     "show MEDIUM --plot new/a.png": ("cannot write new/a.png: there is no folder new", ""),
     "export DISCRETE --out out.hdf5": ("must be a Box space", ""),
     "export-policy nowhere --out policy.pt": ("no run or policy file nowhere", ""),
-    "export-policy . --out policy.pt": ("no run or policy file policy.safetensors", ""),
+    "export-policy . --out policy.pt": ("no run in . (no config.json)", ""),
     "export-policy empty.safetensors --out policy.pt": ("not a readable policy file", ""),
     "completion tcsh": ("invalid choice: 'tcsh'", "bash"),
     "behaviour hoper": ("did you mean 'hopper'?", ""),

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,14 @@ import pytest
 
 import offbench
 from offbench.cli.main import main
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import exclusive_lock
+from offbench.common.settings import setting
 from offbench.data import minari_store, transitions
 from offbench.envs.environments import make_env, untrusted_env
+from offbench.evaluation.similarity import read_similarity
+from offbench.training.spec import variant
+from tests.faults.test_integrity import trained
 
 SMALL: dict[str, Any] = {"eval_every": 50, "eval_episodes": 1, "workers": 1, "hidden": (8, 8), "batch_size": 16}
 
@@ -127,3 +132,64 @@ def test_absurd_sizes_are_one_line(flag: str, medium: str, capsys: pytest.Captur
     assert stop.value.code == 2
     last = capsys.readouterr().err.splitlines()[-1]
     assert "not enough memory" in last or "workers must be from 1 to 1,000" in last
+
+
+@pytest.mark.parametrize("rows", ["nan,1\n", "1e999,1\n", "-5,1\n", "200,1\n100,1\n", "100,1\n100,2\n", "1e300,1\n"])
+def test_rows_of_losses_at_impossible_steps_are_damage(tmp_path: Path, rows: str) -> None:
+    run = trained(tmp_path / "seed-0")
+    run.losses_path.write_text("step,q_abs\n" + rows)
+    with pytest.raises(DamagedError, match=r"losses\.csv"):
+        run.losses()
+
+
+def test_markup_in_a_name_is_text_in_markdown_and_latex(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = trained(tmp_path / "seed-0")
+    name = "<script>|[x](javascript:y)\\input{x}"
+    run.config_path.write_text(json.dumps(json.loads(run.config_path.read_text()) | {"dataset": name}))
+    main(["normalize", "--runs", str(tmp_path), "--format", "markdown"])
+    text = capsys.readouterr().out
+    assert "<script>" not in text
+    assert r"\|\[x\](javascript:y)" in text
+    main(["normalize", "--runs", str(tmp_path), "--format", "latex"])
+    assert r"\input" not in capsys.readouterr().out
+
+
+def test_variants_keep_every_digit_and_letter() -> None:
+    @dataclass(frozen=True)
+    class Config:
+        rate: float = setting(1.0, "")
+        mode: str = setting("a", "")
+
+    names = [
+        variant(Config(rate, mode)) for rate in (0.00012345678, 0.00012345679) for mode in ("B", "b", "x/y", "x,y")
+    ]
+    assert len({name.lower() if "mode=b" not in name.lower() else name for name in names}) == 8
+    assert not any("/" in name for name in names)
+    assert variant(Config(0.0003)) == "rate=0.0003"  # as ever
+
+
+def test_a_setting_of_texts_is_one_folder_name() -> None:
+    @dataclass(frozen=True)
+    class Config:
+        parts: tuple[str, ...] = setting((), "")
+
+    names = [variant(Config(parts)) for parts in (("a", "b"), ("axb",), ("a/../../b",), ("a,b",))]
+    assert names == ["parts=axb", "parts=a%78b", "parts=a%2F..%2F..%2Fb", "parts=a%2Cb"]
+
+
+@pytest.mark.parametrize("change", [{"q_similar": 1e308}, {"action_similar": -50}, {"samples": -1}, {"tolerance": -1}])
+def test_a_similar_score_out_of_range_is_damage(change: dict[str, float], tmp_path: Path) -> None:
+    run = trained(tmp_path / "seed-0")
+    sound = {
+        "step": 1,
+        "samples": 5,
+        "q_similar": 99.0,
+        "tolerance": 0.05,
+        "action_similar": 9.0,
+        "action_tolerance": 0.1,
+    }
+    (run.folder / "similarity.json").write_text(json.dumps(sound))
+    assert read_similarity(run) is not None
+    (run.folder / "similarity.json").write_text(json.dumps(sound | change))
+    with pytest.raises(DamagedError, match="out of range"):
+        read_similarity(run)

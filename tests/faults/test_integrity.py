@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -20,12 +19,10 @@ from offbench.analysis import normalize
 from offbench.cli.main import main
 from offbench.common import files
 from offbench.common.errors import DamagedError, OffbenchError
-from offbench.common.settings import setting
 from offbench.common.text import no_formula, printable
 from offbench.data import transitions
 from offbench.training import registry
 from offbench.training.run import Run, find_runs
-from offbench.training.spec import variant
 from tests.cli.test_bad_input import refusal
 from tests.made_runs import made_run
 
@@ -97,6 +94,9 @@ def test_leftovers_of_any_process_are_removed_under_the_lock(tmp_path: Path) -> 
         (ROWS.replace("100,0,1.0,5\n", ""), "step 100"),
         (ROWS.replace("4.0", "1e308"), "1e+308"),
         (ROWS.replace("4.0", "nan"), "nan"),
+        (ROWS.replace("4.0", "1_000"), "1_000"),
+        (ROWS.replace("4.0", "٤"), "٤"),
+        (ROWS.replace("4.0", " 4"), "' 4'"),
     ],
 )
 def test_rows_that_do_not_fit_their_key_are_damage(
@@ -130,7 +130,18 @@ def test_an_earlier_runs_precision_is_read_from_its_tf32(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    "change", [{"sessions": [3]}, {"sessions": {}}, {"sessions": None}, {"env_spec": "{"}, {"steps": 10**15}]
+    "change",
+    [
+        {"sessions": [3]},
+        {"sessions": {}},
+        {"sessions": None},
+        {"env_spec": "{"},
+        {"steps": 10**15},
+        {"format": "offbench-run-2"},
+        {"label": "a\nhopper-medium-v0  fake  999.9"},
+        {"variant": "alpha=2\n\\input{x}"},
+        {"dataset": "a\u2028b"},
+    ],
 )
 def test_a_config_of_other_types_is_damage(
     tmp_path: Path, change: dict[str, object], capsys: pytest.CaptureFixture[str]
@@ -150,20 +161,6 @@ def test_a_run_with_an_unreadable_config_is_named(tmp_path: Path, capsys: pytest
     assert "seed-1/config.json" in capsys.readouterr().err
 
 
-def test_variants_keep_every_digit_and_letter() -> None:
-    @dataclass(frozen=True)
-    class Config:
-        rate: float = setting(1.0, "")
-        mode: str = setting("a", "")
-
-    names = [
-        variant(Config(rate, mode)) for rate in (0.00012345678, 0.00012345679) for mode in ("B", "b", "x/y", "x,y")
-    ]
-    assert len({name.lower() if "mode=b" not in name.lower() else name for name in names}) == 8
-    assert not any("/" in name for name in names)
-    assert variant(Config(0.0003)) == "rate=0.0003"  # as ever
-
-
 def test_escape_sequences_are_shown_not_obeyed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = trained(tmp_path / "seed-0")
     config = json.loads(run.config_path.read_text()) | {"dataset": "\x1b]0;owned\x07\x1b[2J\u202e"}
@@ -173,9 +170,10 @@ def test_escape_sequences_are_shown_not_obeyed(tmp_path: Path, capsys: pytest.Ca
     assert "\\x1b[2J" in shown
     assert not set(shown) & set("\x1b\x07\u202e")
     assert printable("a\tb\n±é") == "a\tb\n±é"
+    assert printable("\u061c\u200b\u2028\U000e0041") == "\\u061c\\u200b\\u2028\\U000e0041"
 
 
-@pytest.mark.parametrize("cell", ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\t=1"])
+@pytest.mark.parametrize("cell", ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\t=1", " =1", "\n=1"])
 def test_no_cell_is_a_formula(cell: str) -> None:
     text = normalize.render([{"dataset": cell, "return": -1.5}], "csv")
     header, row = csv.reader(io.StringIO(text))
