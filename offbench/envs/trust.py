@@ -109,19 +109,20 @@ def _check_installed(module: str) -> None:
     """Check that Python would import an allowed package as it was installed, and not a folder of the same name.
 
     Raises:
-        OffbenchError: the package is not installed, or another folder hides it, such as one in the working directory.
+        OffbenchError: there is such a folder, in the working directory for example.
     """
     package = module.partition(".")[0]
     if package in sys.modules or package not in DISTRIBUTIONS:
         return
-    try:
-        installed = importlib.metadata.distribution(DISTRIBUTIONS[package]).locate_file(package)
-    except importlib.metadata.PackageNotFoundError:
-        raise OffbenchError(f"it needs {module}; install the package {DISTRIBUTIONS[package]}") from None
     found = importlib.util.find_spec(package)
-    folders = [os.path.realpath(path) for path in (found.submodule_search_locations or [])] if found else []
-    if os.path.realpath(str(installed)) not in folders:
-        raise OffbenchError(f"it would run {module} from {', '.join(folders)}, not as installed; {REMEDY}")
+    if found is None:
+        return  # importing it says so
+    folders = [os.path.realpath(path) for path in found.submodule_search_locations or ()]
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        installed = importlib.metadata.distribution(DISTRIBUTIONS[package]).locate_file(package)
+        if os.path.realpath(str(installed)) in folders:
+            return
+    raise OffbenchError(f"it would run {module} from {', '.join(folders)}, where it is not installed; {REMEDY}")
 
 
 def _is_allowed(module: str, name: str, base: type) -> bool:

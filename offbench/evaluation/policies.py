@@ -28,7 +28,7 @@ def load_policy(path: str | Path) -> Policy:
     if not run.policy_path.exists():
         raise OffbenchError(f"{path} has no policy yet; train the run to its first checkpoint")
     policy = read_policy(run.policy_path)
-    for key in ("algorithm", "seed", "dataset_sha256"):
+    for key in ("seed", "dataset_sha256"):
         found = policy.origin.get(key, getattr(config, key))
         if found != getattr(config, key):
             raise OffbenchError(

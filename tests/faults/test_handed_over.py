@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import sys
 from dataclasses import dataclass
@@ -46,7 +45,7 @@ def test_a_folder_named_like_an_allowed_package_is_not_imported(home: Path, monk
         (home / name).write_text("open('ran', 'w')")
     monkeypatch.syspath_prepend(home)
     spec = json.loads(make_env_spec()) | {"id": "Foo-v0", "entry_point": "gym.envs.evil:X"}
-    with pytest.raises(OffbenchError, match=re.escape("it needs gym.envs.evil; install the package gym")):
+    with pytest.raises(OffbenchError, match=r"it would run gym\.envs\.evil from .*, where it is not installed"):
         untrusted_env(json.dumps(spec), "the run")
     assert not (home / "ran").exists()
     package = home / "gym-0.26.dist-info"  # installed elsewhere, and hidden by that folder
@@ -55,7 +54,7 @@ def test_a_folder_named_like_an_allowed_package_is_not_imported(home: Path, monk
     (home / "site").mkdir()
     package.rename(home / "site" / package.name)
     monkeypatch.setattr(sys, "path", [*sys.path, str(home / "site")])
-    with pytest.raises(OffbenchError, match=r"it would run gym\.envs\.evil from .*, not as installed"):
+    with pytest.raises(OffbenchError, match=r"it would run gym\.envs\.evil from .*, where it is not installed"):
         untrusted_env(json.dumps(spec), "the run")
     assert not (home / "ran").exists()
 
