@@ -149,7 +149,7 @@ def read_ladder(folder: Path) -> Ladder | None:
         ladder = Ladder(folder, info, rungs)
         numbers = [info.references[name][key] for name in ("random", "expert") for key in REFERENCE]
         if not all(abs(number) < LARGEST for number in numbers):
-            raise ValueError("its references are not finite, or absurd")
+            raise ValueError(f"its references must be finite and below {LARGEST:g}")
         if not are_references(ladder.random_return, ladder.expert_return):
             raise ValueError("its references are equal, or out of order")
         if not (info.levels["medium"] and ladder.role("medium") and ladder.role("expert")):
