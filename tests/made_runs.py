@@ -28,11 +28,15 @@ def made_run(
     settings: dict[str, Any] | None = None,
     beta: float | None = None,
     noise: float = 3.0,
+    returns: dict[int, float] | None = None,
 ) -> Run:
-    """Write one run whose score rises to about `level`: config, 12 evaluations of 3 episodes, losses."""
+    """Write one run: config, evaluations of 3 episodes, losses.
+
+    Its score rises to about `level` in 12 evaluations; or its evaluations have the `returns` given for each step.
+    """
     run = Run(run_folder(root, dataset, algorithm, variant, seed))
     run.folder.mkdir(parents=True)
-    every = steps // 12
+    every = min(returns) if returns else steps // 12
     config: dict[str, Any] = {
         "format": "offbench-run-1",
         "algorithm": algorithm,
@@ -55,8 +59,8 @@ def made_run(
     rng = np.random.default_rng([seed, sum(f"{dataset}{algorithm}{variant}".encode())])
     level += float(rng.normal(0, noise))
     stop = steps if reached is None else reached
-    evaluations = {}
-    for step in range(every, stop + 1, every):
+    evaluations = {step: [(value, 500)] * 3 for step, value in (returns or {}).items()}
+    for step in () if returns else range(every, stop + 1, every):
         mean = level * (1 - np.exp(-4 * step / steps)) + rng.normal(0, noise)
         evaluations[step] = [(float(mean + rng.normal(0, noise)), 500) for _ in range(3)]
     run.write_evaluations(evaluations)

@@ -19,7 +19,7 @@ from offbench.common import scores
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, csv_bytes
 from offbench.common.tables import latex, markdown, plain, tabular
-from offbench.common.text import aligned, compact, no_formula
+from offbench.common.text import aligned, compact, no_formula, printable
 from offbench.envs.recipes import load_recipe
 from offbench.training.run import DIGITS, Run, find_runs
 
@@ -167,7 +167,7 @@ def render(rows: Sequence[Row], style: str = "table") -> str:
         )
     if style == "latex":
         header, *cells = [[latex(text) for text in line] for line in [header, *cells]]
-        comments = (f"% note: {' '.join(note.split())}" for note in notes(rows))
+        comments = (f"% note: {printable(' '.join(note.split()))}" for note in notes(rows))
         return "\n".join([*tabular(header, cells, len(header)), *comments])
     lines = aligned(header, cells, sum(key in NAMES for key in keys))
     return "\n".join([*lines, *(f"note: {note}" for note in notes(rows))])

@@ -25,7 +25,7 @@ from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import READ_REMEDIES
 from offbench.common.scores import LAST, Evaluations, mean_std, normalize, run_return, window
 from offbench.common.terminal import warn
-from offbench.common.text import from_to, plural, printable
+from offbench.common.text import from_to, plural
 from offbench.data.levels import LEVELS
 from offbench.training.run import DIGITS, Run, RunConfig, find_runs
 
@@ -67,11 +67,12 @@ class Task:
 
 @dataclass(frozen=True)
 class Trained:
-    """One run and what has been evaluated of it."""
+    """One run, what has been evaluated of it, and the rows of its losses.csv."""
 
     run: Run
     config: RunConfig
     evaluations: Evaluations
+    losses: Sequence[Mapping[str, float]] = ()
 
     @property
     def seed(self) -> int:
@@ -284,7 +285,7 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
     damaged: list[OffbenchError] = []
     for run in runs:
         try:
-            config, evaluations = run.config(), run.evaluations()
+            trained = Trained(run, run.config(), run.evaluations(), run.losses())
         except OffbenchError as error:
             damaged.append(error)
             continue
@@ -292,15 +293,16 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
             words = f"cannot read {run.folder}: {error.strerror}; {READ_REMEDIES.get(error.errno, 'try again')}"
             damaged.append(OffbenchError(words))
             continue
-        if evaluations:
+        if trained.evaluations:
+            config = trained.config
             key = (config.dataset, config.dataset_sha256, config.algorithm, config.variant)
-            groups.setdefault(key, []).append(Trained(run, config, evaluations))
+            groups.setdefault(key, []).append(trained)
         else:
             waiting.append(run)
     if damaged and not groups:
         raise damaged[0]
     for reason in damaged:
-        warn(f"left out: {printable(str(reason))}")
+        warn(f"left out: {reason}")
     tasks = _tasks(groups)
     configs: dict[tuple[str, str], list[RunConfig]] = {}
     for (_, _, algorithm, variant), group in groups.items():

@@ -158,7 +158,7 @@ def _main(words: list[str]) -> None:
     except BrokenPipeError:  # the reader of a pipe (`| head`) has left
         sys.exit(0)
     except Exception as error:
-        labeled("offbench", printable(" ".join(failure(error).split())), "bold red")
+        labeled("offbench", " ".join(failure(error).split()), "bold red")
         sys.exit(2)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -42,6 +43,19 @@ LAST = 10  # evaluations that a run's score is the mean of
 def window(evaluations: Evaluations) -> tuple[int, ...]:
     """Return the steps of the evaluations that a run's score is the mean of: its last 10."""
     return tuple(sorted(evaluations)[-LAST:])
+
+
+def check_steps(steps: Sequence[int], every: int) -> None:
+    """Check that the evaluations of a run are those due every `every` updates; the last one may lie before its turn.
+
+    Raises:
+        ValueError: one is missing, or is of a step at which none is due.
+    """
+    for due, step in zip(itertools.count(every, every), steps, strict=False):
+        if step > due:
+            raise ValueError(f"the evaluation of step {due} is missing")
+        if step < due and step != steps[-1]:
+            raise ValueError(f"there is an evaluation of step {step}, and one is due every {every} steps")
 
 
 def run_return(evaluations: Evaluations) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from offbench.common.files import csv_bytes
-from offbench.common.text import no_formula
+from offbench.common.text import no_formula, printable
 
 SPECIAL = {
     "\\": r"\textbackslash{}",
@@ -88,7 +88,7 @@ class Table:
     def latex(self) -> str:
         """Return the table as LaTeX (booktabs), the notes as comments; the best in bold."""
         body = [[f"\\textbf{{{latex(c.full)}}}" if c.best else latex(c.full) for c in row] for row in self.rows]
-        notes = [f"% {' '.join(note.split())}" for note in (self.title, *self.notes)]
+        notes = [f"% {printable(' '.join(note.split()))}" for note in (self.title, *self.notes)]
         return "\n".join([*notes, *tabular([latex(text) for text in self.columns()], body, self.heads)]) + "\n"
 
 
@@ -99,7 +99,7 @@ def files(table: Table) -> Mapping[str, bytes]:
 
 def latex(text: str) -> str:
     """Return text with everything escaped that LaTeX would take for a command."""
-    return "".join(SPECIAL.get(character, character) for character in text)
+    return "".join(SPECIAL.get(character, character) for character in printable(text))
 
 
 def tabular(header: Sequence[str], cells: Sequence[Sequence[str]], names: int) -> list[str]:
@@ -112,7 +112,7 @@ def tabular(header: Sequence[str], cells: Sequence[Sequence[str]], names: int) -
 
 def plain(text: str) -> str:
     """Return text that Markdown prints as it is."""
-    escaped = "".join("\\" + c if c in "\\`*_[]|#" else c for c in text)
+    escaped = "".join("\\" + c if c in "\\`*_[]|#" else c for c in printable(text))
     return html.escape(escaped, quote=False).replace("\n", " ")
 
 

@@ -49,15 +49,15 @@ def say(line: str, style: str = "") -> None:
 
 def labeled(label: str, text: str, style: str, *, wrap: bool = True) -> None:
     """Print `label: text` to stderr. On a terminal the label is styled, and lines end between words (with `wrap`)."""
+    message = printable(f"{label}: {text}")
     if is_terminal(sys.stderr):
         from rich.text import Text
 
         screen = console(sys.stderr)
-        message = printable(f"{label}: {text}")
         message = _wrapped(message, screen.width) if wrap else message
         screen.print(Text.assemble((f"{label}:", style), message[len(label) + 1 :]), soft_wrap=True)
     else:
-        print(f"{label}: {text}", file=sys.stderr, flush=True)
+        print(message, file=sys.stderr, flush=True)
 
 
 def hint(*words: str) -> None:

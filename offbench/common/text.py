@@ -71,8 +71,14 @@ def printable(text: str) -> str:
 
 
 def no_formula(cell: object) -> object:
-    """Return a CSV cell that no spreadsheet takes for a formula: such text gets an apostrophe in front."""
-    if not (isinstance(cell, str) and cell[1:] and (cell[0] in "\t\r" or cell.lstrip()[:1] in tuple("=+-@"))):
+    """Return a CSV cell that no spreadsheet takes for a formula: such text gets an apostrophe in front.
+
+    Control characters are escaped as by `printable`.
+    """
+    if not isinstance(cell, str):
+        return cell
+    cell = printable(cell)
+    if not (cell[1:] and (cell[0] == "\t" or cell.lstrip()[:1] in tuple("=+-@"))):
         return cell
     try:
         float(cell)

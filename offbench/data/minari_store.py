@@ -17,7 +17,7 @@ import numpy.typing as npt
 from filelock import FileLock, Timeout
 
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
-from offbench.common.files import ORPHANS, JsonObject, damage, disk_errors, exclusive_lock, read_json
+from offbench.common.files import ORPHANS, JsonObject, damage, delete, disk_errors, exclusive_lock, read_json
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.scores import are_references
 from offbench.common.settings import read_back, setting
@@ -114,6 +114,10 @@ def _absent(dataset_id: str) -> OffbenchError:
     if os.path.isfile(dataset_id):  # unlike Path.is_file, False for a name that no file can have
         what = "a file, not a dataset's id; `offbench import-d4rl` converts D4RL's HDF5 files"
         return OffbenchError(f"{dataset_id} is {what}")
+    path = root() / dataset_id
+    if _inside(dataset_id) and os.path.lexists(old := _beside(path, "old")):
+        why = "its replacement was interrupted, and it could not be put back"
+        return OffbenchError(f"{dataset_id} is not there: {why}; rename {old} to {path}")
     if os.path.isfile(os.path.join(dataset_id, "data", "metadata.json")):
         path = Path(dataset_id).absolute()
         what = f"a folder, not a dataset's id; set MINARI_DATASETS_PATH={path.parent} and give {path.name}"
@@ -183,10 +187,15 @@ def _check_metadata(metadata: JsonObject) -> None:
 
 def exists(dataset_id: str) -> bool:
     """Return whether there is a local dataset of this id, sound or not. Raises OffbenchError if that is unknown."""
-    inside = not dataset_id.startswith((".", "/")) and ".." not in Path(dataset_id).parts and "\0" not in dataset_id
     path = root() / dataset_id / "data" / "metadata.json"
     with damage(str(path), "cannot be looked up", "check the id and the disk"):
-        return inside and (path.exists() or (_put_back(root() / dataset_id) and path.exists()))
+        return _inside(dataset_id) and (path.exists() or (_put_back(root() / dataset_id) and path.exists()))
+
+
+def _inside(dataset_id: str) -> bool:
+    """Return whether an id names a folder below the root."""
+    parts = Path(dataset_id).parts
+    return bool(parts) and ".." not in parts and "\0" not in dataset_id and not dataset_id.startswith((".", "/"))
 
 
 def provenance(metadata: JsonObject) -> Provenance:
@@ -344,10 +353,9 @@ def _recover(path: Path) -> None:
     old = _beside(path, "old")
     if old.exists() and not path.exists():
         old.replace(path)
-    if old.is_symlink():
-        old.unlink()  # never what it leads to
     for left in (old, _beside(path, "partial")):
-        shutil.rmtree(left, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            delete(left)
 
 
 def _buffers(

@@ -22,7 +22,7 @@ from offbench.analysis.statistics import Estimate, curve, iqm, profile
 from offbench.common.arrays import Array
 from offbench.common.plotting import figure, picture_file, save
 from offbench.common.scores import LAST
-from offbench.common.text import compact
+from offbench.common.text import compact, printable
 from offbench.reports.tables import Aggregates
 
 if TYPE_CHECKING:
@@ -223,7 +223,7 @@ def loss_figure(
 def _column(entry: Entry, column: str) -> tuple[list[int], Array] | None:
     """Return (steps, values [runs, steps]) of the rows that all runs have; long series are thinned."""
     series = [
-        {int(row["step"]): row[column] for row in t.run.losses() if {"step", column} <= row.keys()} for t in entry.runs
+        {int(row["step"]): row[column] for row in t.losses if {"step", column} <= row.keys()} for t in entry.runs
     ]
     steps = sorted(set.intersection(*(set(run) for run in series)))
     steps = steps[:: max(1, len(steps) // 200)]
@@ -250,13 +250,14 @@ def _named_rows(axes: Axes, names: Sequence[str]) -> None:
 def _two_lines(name: str) -> str:
     """Return a long name on two lines, split after the first of its settings or, if it has one, before it."""
     if len(name) <= 24:
-        return name
+        return printable(name)
     head, comma, tail = name.partition("," if "," in name else " ")
     return f"{shortened(head + comma.rstrip(), 24)}\n{shortened(tail.lstrip(), 24)}".rstrip()
 
 
 def shortened(text: str, most: int) -> str:
     """Return text without its middle where it is too long for a picture: variants differ at their ends."""
+    text = printable(text)
     return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most - most // 2 - 1) :]}"
 
 
@@ -303,10 +304,14 @@ def _style(name: str) -> Any:
 
 
 def _legend(looks: Sequence[Line], most: int = 32) -> tuple[list[Line2D], list[str]]:
-    """Return the lines and names of a legend, the names shortened to `most` characters."""
+    """Return the lines and names of a legend: names shortened to `most` characters, numbered where they are alike."""
     from matplotlib.lines import Line2D
 
-    names = [f" {shortened(look.label, most)}" for look in looks]  # matplotlib hides labels that begin with _
+    cut = [shortened(look.label, most) for look in looks]
+    names = [  # matplotlib hides labels that begin with _
+        f" {text}" if cut.count(text) == 1 else f" {number}. {shortened(look.label, most - 4)}"
+        for number, (look, text) in enumerate(zip(looks, cut, strict=True), 1)
+    ]
     return [Line2D([], [], color=look.color, linestyle=look.style) for look in looks], names
 
 

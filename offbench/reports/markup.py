@@ -5,6 +5,8 @@ from __future__ import annotations
 import html
 import re
 
+from offbench.common.text import printable
+
 
 class Markup(str):
     """Text that is HTML and stays as it is."""
@@ -24,21 +26,25 @@ def tag(name: str, /, *children: str | Markup, **attributes: str | int | bool | 
         if value is True:
             parts.append(key)
         elif value is not None and value is not False:
-            parts.append(f'{key}="{html.escape(str(value), quote=True)}"')
+            parts.append(f'{key}="{_escaped(str(value), quote=True)}"')
     opening = f"<{' '.join(parts)}>"
     return Markup(opening) if name in VOID else Markup(f"{opening}{join(*children)}</{name}>")
 
 
+def _escaped(text: str, quote: bool = False) -> str:
+    return html.escape(printable(text), quote)
+
+
 def join(*children: str | Markup) -> Markup:
     """Return markup and text (escaped) one after another."""
-    return Markup("".join(c if isinstance(c, Markup) else html.escape(c, quote=False) for c in children))
+    return Markup("".join(c if isinstance(c, Markup) else _escaped(c) for c in children))
 
 
 def breakable(text: str) -> Markup:
     """Return short text as one piece; long text may break after commas (not those of 1,000), slashes, equals signs."""
     if len(text) <= SHORT:
         return tag("span", text, class_="short")
-    return Markup(re.sub(r"(,(?!\d)|[=/])", r"\1<wbr>", html.escape(text, quote=False)))
+    return Markup(re.sub(r"(,(?!\d)|[=/])", r"\1<wbr>", _escaped(text)))
 
 
 def prose(text: str) -> Markup:

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 from offbench.analysis.methods import Method
 from offbench.analysis.results import Entry, Results
+from offbench.common.errors import OffbenchError
 from offbench.common.scores import mean_std, plus_minus
 from offbench.common.tables import Cell, Table
+from offbench.common.terminal import warn
 from offbench.evaluation.similarity import Similarity, read_similarity
 from offbench.reports.tables import NONE, is_papers_grid, published, row_name
 
@@ -51,8 +53,17 @@ def similarity_tables(results: Results) -> list[Table]:
 
 
 def _similar(entry: Entry) -> list[Similarity]:
-    """Return the similar scores of the runs of a cell that have one."""
-    return [score for trained in entry.runs if (score := read_similarity(trained.run)) is not None]
+    """Return the similar scores of the runs of a cell that have one; damaged ones are named on stderr."""
+    scores = []
+    for trained in entry.runs:
+        try:
+            score = read_similarity(trained.run)
+        except OffbenchError as error:
+            warn(f"left out of the similar scores: {error}")
+            continue
+        if score is not None:
+            scores.append(score)
+    return scores
 
 
 def _similar_name(method: Method) -> str:

@@ -194,15 +194,12 @@ def _check_environment(spec: RunSpec, data: Transitions) -> None:
 def _check_evaluations(spec: RunSpec) -> None:
     """Refuse a run that lacks an evaluation before its newest checkpoint: resuming it would give another score."""
     newest = max(checkpoints.steps(spec.folder), default=0)
-    if not newest:
-        return
-    evaluations = spec.run.evaluations()
-    for step in range(spec.eval_every, newest, spec.eval_every):
-        if step not in evaluations:
-            raise OffbenchError(
-                f"{spec.run.evaluations_path} lacks the evaluation of step {step}; put the file back, or delete the "
-                "run to repeat it"
-            )
+    last = (newest - 1) // spec.eval_every * spec.eval_every  # that of `newest` itself may have been under way
+    if last > 0 and last not in spec.run.evaluations():
+        raise OffbenchError(
+            f"{spec.run.evaluations_path} lacks the evaluation of step {last}; put the file back, or delete the "
+            "run to repeat it"
+        )
 
 
 def _run_config(spec: RunSpec, data: Transitions, device: str, command: str) -> RunConfig:

@@ -35,7 +35,7 @@ from offbench.common.files import (
     write_json,
 )
 from offbench.common.provenance import Hardware, MadeWith
-from offbench.common.scores import LARGEST, Evaluations, are_references
+from offbench.common.scores import LARGEST, Evaluations, are_references, check_steps
 from offbench.common.settings import read_back
 from offbench.training.registry import current_settings
 from offbench.training.source_code import changes
@@ -285,7 +285,7 @@ class Run:
 
         Raises:
             OffbenchError: the file is damaged: a row is malformed, an episode is missing or there twice, or the steps
-                are not those of config.json.
+                are not those at which config.json has evaluations.
         """
         if not self.evaluations_path.exists():
             if self.has_checkpoint:  # which is written after it
@@ -305,7 +305,7 @@ class Run:
                     value, step = _number(row["return"]), _count(row["step"])
                     if not abs(value) < LARGEST:
                         raise ValueError(f"a return is {value}")
-                    if step > last:
+                    if not 0 < step <= last:
                         raise ValueError(f"step {step} of a run of {last} steps")
                     episodes = evaluations.setdefault(step, [])
                     if _count(row["episode"]) != len(episodes):
@@ -314,7 +314,10 @@ class Run:
             for step, episodes in evaluations.items():
                 if len(episodes) != (count or len(episodes)):
                     raise ValueError(f"step {step} has {len(episodes)} episodes, not {count}")
-        return dict(sorted(evaluations.items()))
+            evaluations = dict(sorted(evaluations.items()))
+            if config and config.eval_every:
+                check_steps(list(evaluations), config.eval_every)
+        return evaluations
 
     def write_evaluations(self, evaluations: Evaluations) -> None:
         """Replace evaluations.csv."""

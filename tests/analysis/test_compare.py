@@ -19,7 +19,7 @@ def scores(
 ) -> None:
     """Write one run a seed; the made runs' own reference is 0 to 100, so a return is a score."""
     for seed, value in enumerate(values):
-        made_run(root, dataset, algorithm, variant, seed, 0).write_evaluations({30_000: [(value, 5)] * 3})
+        made_run(root, dataset, algorithm, variant, seed, 0, returns={30_000: value})
 
 
 def test_three_seeds_by_hand(home: Path) -> None:
@@ -86,8 +86,7 @@ def test_one_seed_is_no_evidence(home: Path) -> None:
 def test_unequal_training_is_said(home: Path) -> None:
     scores(home / "runs", "td3_bc", [50.0, 50.0])
     for seed in range(2):
-        run = made_run(home / "runs", "hopper-medium-v0", "cql", "default", seed, 0)
-        run.write_evaluations({3000: [(40.0, 5)] * 3})
+        made_run(home / "runs", "hopper-medium-v0", "cql", "default", seed, 0, returns={3000: 40.0})
     text = "\n".join(offbench.compare("td3_bc", "cql").lines())
     assert "evaluated at different steps: td3_bc 1 evaluation, step 30,000; cql 1 evaluation, step 3,000" in text
     assert "no verdict" in text
@@ -105,8 +104,8 @@ def test_a_variant_may_be_named_as_tables_name_it(home: Path) -> None:
     """The adaptive beta is BDB's default: a folder says `default`, a table `bdb (adaptive)`."""
     scores(home / "runs", "td3_bc", [1.0])
     for seed, value in enumerate([2.0, 3.0]):
-        run = made_run(home / "runs", "hopper-medium-v0", "bdb", "default", seed, 0, settings={"beta": "adaptive"})
-        run.write_evaluations({30_000: [(value, 5)] * 3})
+        beta, returns = {"beta": "adaptive"}, {30_000: value}
+        made_run(home / "runs", "hopper-medium-v0", "bdb", "default", seed, 0, settings=beta, returns=returns)
     for name in ("bdb", "bdb (adaptive)", "bdb/default", "bdb/beta=adaptive", "bdb/adaptive", "bdb beta=adaptive"):
         assert compare(name, "td3_bc", runs="runs").a == "bdb (adaptive)"
     assert compare("bdb (adaptive) (30,000 steps)", "td3_bc", runs="runs").a == "bdb (adaptive)"  # a column's heading

@@ -16,8 +16,8 @@ def test_a_long_curve_shows_the_score_at_each_step() -> None:
     rng = np.random.default_rng(0)
     returns = rng.uniform(0, 100, (2, 50))  # the references are 0 and 100: a score is a return
     for seed in range(2):
-        run = made_run(Path("runs"), "hopper-medium-v0", "td3_bc", "default", seed, 50.0, steps=600_000)
-        run.write_evaluations({12_000 * (i + 1): [(value, 100)] * 3 for i, value in enumerate(returns[seed].tolist())})
+        made = {12_000 * (i + 1): value for i, value in enumerate(returns[seed].tolist())}
+        made_run(Path("runs"), "hopper-medium-v0", "td3_bc", "default", seed, 0, steps=600_000, returns=made)
     (entry,) = read_results("runs").entries.values()
     steps, points = entry.drawn_curve()
     assert entry.smoothed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -238,6 +239,20 @@ def test_a_replacement_that_fails_at_the_last_moment_keeps_the_old_dataset(
         with pytest.raises(OffbenchError, match="Input/output error"):
             offbench.collect(recipe, "random", behaviour_dir=behaviour_dir, workers=1, steps=60, overwrite=True)
     assert json.dumps(minari_store.read_metadata(name)) == before
+
+
+def test_a_replaced_dataset_that_cannot_be_put_back_is_named(tiny: tuple[str, str]) -> None:
+    recipe, behaviour_dir = tiny
+    name = offbench.collect(recipe, "random", behaviour_dir=behaviour_dir, workers=1, steps=50)
+    path = minari_store.path_of(name)
+    old = path.rename(path.with_name(f".offbench-{name}.old"))
+    lock = path.with_name(f".offbench-{name}.lock")
+    lock.unlink(missing_ok=True)
+    lock.mkdir()  # as in a folder that may not be written: the lock cannot be taken
+    with pytest.raises(OffbenchError, match=re.escape(f"rename {old} to {path}")):
+        offbench.verify(name)
+    old.rename(path)
+    assert offbench.verify(name).ok
 
 
 def test_environments_that_reuse_their_array_are_recorded_right() -> None:

@@ -133,6 +133,27 @@ def test_absurd_sizes_are_one_line(flag: str, medium: str, capsys: pytest.Captur
     assert "not enough memory" in last or "workers must be from 1 to 1,000" in last
 
 
+@pytest.mark.parametrize(
+    ("steps", "fault"),
+    [
+        ([100, 300], "the evaluation of step 200 is missing"),
+        ([200], "the evaluation of step 100 is missing"),
+        ([100, 150, 200], "an evaluation of step 150"),
+        ([0, 100], "step 0 of a run"),
+    ],
+)
+def test_evaluations_at_other_steps_than_they_are_due_are_damage(tmp_path: Path, steps: list[int], fault: str) -> None:
+    run = trained(tmp_path / "seed-0")
+    config = json.loads(run.config_path.read_text()) | {"steps": 400, "eval_every": 100}
+    run.config_path.write_text(json.dumps(config))
+    two = [(1.0, 5), (2.0, 5)]
+    run.write_evaluations(dict.fromkeys(steps, two))
+    with pytest.raises(DamagedError, match=fault):
+        offbench.normalize(tmp_path)
+    run.write_evaluations(dict.fromkeys((100, 200, 250), two))  # as at the end of a run of 250 steps that goes on
+    assert list(run.evaluations()) == [100, 200, 250]
+
+
 @pytest.mark.parametrize("rows", ["nan,1\n", "1e999,1\n", "-5,1\n", "200,1\n100,1\n", "100,1\n100,2\n", "1e300,1\n"])
 def test_rows_of_losses_at_impossible_steps_are_damage(tmp_path: Path, rows: str) -> None:
     run = trained(tmp_path / "seed-0")

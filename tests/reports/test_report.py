@@ -58,10 +58,9 @@ def test_a_whole_grid(home: Path) -> None:
 
 def test_the_score_table_by_hand(home: Path) -> None:
     for seed, value in enumerate((40.0, 50.0, 90.0)):
-        run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", seed, 0)
-        run.write_evaluations({30_000: [(value, 5)] * 3})
-    run = made_run(home / "runs", "hopper-medium-v0", "bdb", "default", 0, 0, settings={"beta": "adaptive"})
-    run.write_evaluations({30_000: [(70.0, 5)] * 3})
+        made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", seed, 0, returns={30_000: value})
+    adaptive, returns = {"beta": "adaptive"}, {30_000: 70.0}
+    made_run(home / "runs", "hopper-medium-v0", "bdb", "default", 0, 0, settings=adaptive, returns=returns)
     offbench.report(home / "runs", home / "out")
     ((row),) = rows(home / "out" / "tables" / "scores.csv")
     assert row["level"] == "medium"
@@ -88,10 +87,9 @@ def test_scores_of_different_evaluations_are_not_ranked(home: Path, capsys: pyte
     """One run is scored over four evaluations, the other over its first alone; bold would say which is better."""
     for dataset, steps in {"hopper-medium-v0": (500,), "hopper-expert-v0": (500, 1000, 1500, 2000)}.items():
         for seed in range(6):
-            run = made_run(home / "runs", dataset, "td3_bc", "default", seed, 0)
-            run.write_evaluations({step: [(10.0 + step / 100, 5)] * 3 for step in (500, 1000, 1500, 2000)})
-            run = made_run(home / "runs", dataset, "bc", "default", seed, 0)
-            run.write_evaluations({step: [(90.0, 5)] * 3 for step in steps})
+            rising = {step: 10.0 + step / 100 for step in (500, 1000, 1500, 2000)}
+            made_run(home / "runs", dataset, "td3_bc", "default", seed, 0, returns=rising)
+            made_run(home / "runs", dataset, "bc", "default", seed, 0, returns=dict.fromkeys(steps, 90.0))
     offbench.report(home / "runs", home / "out")
     medium, expert = [line for line in (home / "out/tables/scores.md").read_text().splitlines() if "hopper" in line]
     assert "**" not in medium
@@ -262,8 +260,7 @@ def test_a_real_training(medium: str, home: Path) -> None:
 def test_bold_improvement_is_compares_verdict(home: Path, seeds: int) -> None:
     for algorithm, value in (("td3_bc", 90.0), ("cql", 10.0)):
         for seed in range(seeds):
-            run = made_run(home / "runs", "hopper-medium-v0", algorithm, "default", seed, 0)
-            run.write_evaluations({30_000: [(value + seed, 5)] * 3})
+            made_run(home / "runs", "hopper-medium-v0", algorithm, "default", seed, 0, returns={30_000: value + seed})
     offbench.report(home / "runs", home / "out")
     evidence = "no evidence" not in offbench.compare("td3_bc", "cql").verdict
     assert evidence == (seeds == 6)  # two seeds of one dataset have p = 1/2, six 1/32
@@ -339,12 +336,30 @@ def test_losses_that_are_not_finite_are_drawn_as_gaps(home: Path) -> None:
     assert "critic" not in Page(offbench.report(home / "runs", home / "out")).ids
 
 
-def test_damaged_similarity_is_said(home: Path) -> None:
-    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
-    for text in ("[]", '{"q_similar": "much"}', "{"):
-        (run.folder / "similarity.json").write_text(text)
-        with pytest.raises(offbench.OffbenchError, match="damaged"):
-            offbench.report(home / "runs", home / "out")
+@pytest.mark.parametrize("text", ["[]", '{"q_similar": "much"}', "{"])
+def test_damaged_similarity_is_left_out(home: Path, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    made_grid(home / "runs", seeds=2, levels=1)
+    (home / "runs/hopper-random-v0/td3_bc/default/seed-0/similarity.json").write_text(text)
+    offbench.report(home / "runs", home / "out")
+    said = capsys.readouterr().err
+    assert said.count("left out of the similar scores") == 1
+    assert "td3_bc/default/seed-0/similarity.json is damaged" in said
+    details = rows(home / "out" / "tables" / "similarity-details.csv")
+    assert {row["method"]: row["seeds"] for row in details if row["method"] in ("td3_bc", "cql")} == {
+        "td3_bc": "1",
+        "cql": "2",
+    }
+
+
+def test_a_run_with_damaged_losses_is_left_out(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for seed in range(2):
+        run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", seed, 0)
+    run.losses_path.write_text("step,q_abs\n1000,many\n")
+    offbench.report(home / "runs", home / "out")
+    assert "left out: " in (said := capsys.readouterr().err)
+    assert f"{run.losses_path} is damaged" in said
+    ((row),) = rows(home / "out" / "tables" / "scores.csv")
+    assert row["td3_bc (30,000 steps)"].endswith("± ?")
 
 
 def test_the_same_runs_give_the_same_bytes(home: Path) -> None:

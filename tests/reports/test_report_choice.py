@@ -20,8 +20,7 @@ def scored(
 ) -> None:
     """Write runs whose every return, and so every score, is `value`."""
     for seed in range(seeds):
-        run = made_run(root, dataset, algorithm, variant, seed, 0)
-        run.write_evaluations({30_000: [(value + seed, 5)] * 3})
+        made_run(root, dataset, algorithm, variant, seed, 0, returns={30_000: value + seed})
 
 
 def test_a_title_some_datasets_and_some_methods(home: Path) -> None:
@@ -63,8 +62,7 @@ def test_the_best_variant_of_a_sweep(home: Path) -> None:
     assert "cql" not in row
     assert "optimistic" in page.text
     # scores of evaluations at other steps are not ranked
-    run = made_run(home / "runs", "x-medium-v0", "td3_bc", "alpha=4", 0, 0)
-    run.write_evaluations({10_000: [(99.0, 5)] * 3})
+    made_run(home / "runs", "x-medium-v0", "td3_bc", "alpha=4", 0, 0, returns={10_000: 99.0})
     offbench.report("runs", "out")
     assert not (home / "out" / "tables" / "best.csv").exists()
 

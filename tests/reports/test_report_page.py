@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import pytest
 from matplotlib.image import imread
 
 import offbench
-from offbench.reports.figures import _tick, shortened
+from offbench.common.text import printable
+from offbench.reports.figures import Line, _legend, _tick, shortened
 from offbench.reports.markup import breakable, prose
 from tests.made_runs import METHODS, made_grid, made_run
 from tests.pages import HOSTILE, Page, hostile_runs
@@ -37,6 +39,31 @@ def test_long_names_are_shortened_in_pictures() -> None:
     assert shortened("td3_bc", 8) == "td3_bc"
     assert shortened("abcdefghijkl", 8) == "abcd…jkl"
     assert len(shortened("x" * 99, 24)) == 24
+
+
+def test_legend_names_that_are_cut_alike_are_numbered() -> None:
+    labels = ["td3_bc", f"bdb ({'a' * 30}b{'c' * 30})", f"bdb ({'a' * 30}d{'c' * 30})"]
+    _, names = _legend([Line(label, "#000000", "-") for label in labels], 32)
+    assert names[0] == " td3_bc"
+    assert [name[:7] for name in names[1:]] == [" 2. bdb", " 3. bdb"]
+    assert max(map(len, names)) <= 33
+
+
+def test_control_characters_are_escaped_in_every_file_of_a_report(home: Path) -> None:
+    made_grid(home / "runs", seeds=2, levels=1)
+    for path in (home / "runs").rglob("config.json"):
+        config = json.loads(path.read_text())
+        config["settings"] |= {"beta": "\x1b]0;owned\x07\u202e"}
+        config |= {"dataset": "\x1b[2J\u202etask", "command": "offbench \x9b2J"}
+        config["hardware"]["processor"] = "\u200bx\x00"
+        path.write_text(json.dumps(config))
+    offbench.report(home / "runs", home / "out")
+    files = [path for path in (home / "out").rglob("*") if path.suffix in (".html", ".md", ".tex", ".csv", ".svg")]
+    assert len(files) > 10
+    assert "\\x1b[2J" in (home / "out" / "tables" / "seeds.csv").read_text()
+    for path in files:
+        text = path.read_text()
+        assert printable(text) == text, path
 
 
 def test_nothing_is_fetched(home: Path) -> None:

@@ -231,7 +231,7 @@ def test_a_run_whose_files_were_deleted_is_not_taken_for_another(medium: str) ->
                 offbench.normalize("runs")
         path.write_bytes(kept)
     run.write_evaluations({step: found for step, found in run.evaluations().items() if step != 200})
-    with pytest.raises(OffbenchError, match="lacks the evaluation of step 200"):
+    with pytest.raises(OffbenchError, match="the evaluation of step 200 is missing"):
         train("td3_bc", medium, "runs", 400)
 
 
