@@ -9,6 +9,7 @@ The same runs and local datasets give the same bytes.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -128,7 +129,8 @@ def _stems(names: Sequence[str]) -> list[str]:
     stems: list[str] = []
     for name in names:
         stem = re.sub(r"[^a-z0-9.-]+", "-", name.lower()).strip("-.") or "task"
-        stems.append(stem if stem not in stems else f"{stem}-{len(stems)}")
+        numbered = (f"{stem}-{number}" for number in itertools.count(len(stems)))
+        stems.append(stem if stem not in stems else next(name for name in numbered if name not in stems))
     return stems
 
 

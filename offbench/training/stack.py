@@ -14,7 +14,7 @@ from offbench.data.transitions import Transitions
 from offbench.rollouts.policy import Policy, check_networks
 from offbench.training.batches import CHUNK, Store, draw_chunk
 from offbench.training.captured_update import Program
-from offbench.training.spec import RunSpec
+from offbench.training.spec import RunSpec, settings_json
 
 
 class Stack:
@@ -78,7 +78,7 @@ class Stack:
         )
 
     def origin(self, run: int) -> JsonObject:
-        """Return which run it is, for its policy and checkpoints."""
+        """Return which run it is, for its policy file."""
         spec, data = self.specs[run], self.data[run]
         return {
             "algorithm": spec.algorithm,
@@ -86,6 +86,10 @@ class Stack:
             "dataset": data.dataset_id,
             "dataset_sha256": data.content,
         }
+
+    def identity(self, run: int) -> JsonObject:
+        """Return which run it is and its settings, for its checkpoints."""
+        return self.origin(run) | settings_json(self.specs[run].config)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return everything learned; runs are axis 1 (a step count has none)."""
@@ -101,12 +105,13 @@ class Stack:
 
     def load(self, run: int, tensors: Mapping[str, Tensor], state: JsonObject) -> None:
         """Put one run's checkpoint back. Raises OffbenchError if it does not fit, or is of another run."""
-        origin = self.origin(run)
-        if state.get("origin", origin) != origin:  # earlier versions wrote none
-            raise OffbenchError(
-                f"the checkpoint in {self.specs[run].folder} is of another run: {state['origin']}; put the run's own "
-                "back, or delete the run to repeat it"
-            )
+        recorded = state.get("origin", {})  # earlier versions wrote none, or not all of it
+        for key, value in self.identity(run).items():
+            if (found := recorded.get(key, value)) != value:
+                raise OffbenchError(
+                    f"the checkpoint in {self.specs[run].folder} is of another run: its {key} is {found}, not "
+                    f"{value}; put the run's own back, or delete the run to repeat it"
+                )
         for name, tensor in self.run_tensors(run).items():
             saved = tensors.get(name)
             if saved is None or saved.shape != tensor.shape:

@@ -177,7 +177,7 @@ class Trainer:
                 run.write_evaluations(self.evaluations[i])
                 run.write_losses(self.losses[i])
                 self.stack.policy(i).save(run.policy_path)
-                state: JsonObject = {"step": step, "origin": self.stack.origin(i)}
+                state: JsonObject = {"step": step, "origin": self.stack.identity(i)}
                 unlogged = self.stack.program.unlogged(i)
                 if unlogged:  # stopped by the clock, between two rows of losses.csv
                     state["unlogged"] = unlogged

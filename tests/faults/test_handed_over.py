@@ -92,6 +92,15 @@ def test_data_that_are_not_those_of_the_recorded_hash_are_neither_loaded_nor_exp
     assert not list(home.glob("*out*"))
 
 
+def test_the_checkpoint_of_other_settings_is_noticed(medium: str) -> None:
+    (one,) = offbench.train("td3_bc", medium, steps=100, alpha=2.0, **SMALL)
+    (other,) = offbench.train("td3_bc", medium, steps=100, alpha=3.0, **SMALL)
+    for path in other.glob("checkpoint-*"):
+        shutil.copy(path, one)
+    with pytest.raises(OffbenchError, match=r"is of another run: its alpha is 3\.0, not 2\.0"):
+        offbench.train("td3_bc", medium, steps=150, alpha=2.0, **SMALL)
+
+
 def test_the_files_of_another_seed_are_noticed(medium: str) -> None:
     one, other = offbench.train("td3_bc", medium, seeds=[0, 1], steps=100, **SMALL)
     policy = (one / "policy.safetensors").read_bytes()
@@ -104,7 +113,7 @@ def test_the_files_of_another_seed_are_noticed(medium: str) -> None:
     for path in other.glob("checkpoint-*"):
         shutil.copy(path, one)
     evaluations = (one / "evaluations.csv").read_bytes()
-    with pytest.raises(OffbenchError, match=r"the checkpoint in .* is of another run"):
+    with pytest.raises(OffbenchError, match=r"the checkpoint in .* is of another run: its seed is 1, not 0"):
         offbench.train("td3_bc", medium, seeds=0, steps=150, **SMALL)
     assert (one / "evaluations.csv").read_bytes() == evaluations
 

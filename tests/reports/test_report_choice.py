@@ -9,6 +9,7 @@ import pytest
 import offbench
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
+from offbench.reports.report import _stems
 from tests.made_runs import METHODS, made_grid, made_run
 from tests.pages import Page, rows
 
@@ -84,3 +85,7 @@ def test_settings_that_names_leave_out_are_said(home: Path) -> None:
     scored(home / "runs", "cql", "bc_steps=120,eval_samples=10", 50)
     page = Page(offbench.report("runs", "out"))
     assert "Settings that differ from the defaults: cql: bc_steps=120, eval_samples=10." in page.text
+
+
+def test_file_names_of_datasets_are_distinct() -> None:
+    assert _stems(["x/2", "x-2", "X", "x 2", "x-2-1"]) == ["x-2", "x-2-1", "x", "x-2-3", "x-2-1-4"]
