@@ -46,4 +46,5 @@ def behaviour(
     ladder = check_output_folder(Path(out) if out else folder.path / "ladder")
     train(folder, steps)
     command = f"offbench behaviour {recipe.name} --seed {seed} --steps {steps}"
-    return build_ladder(folder, steps, ladder, default_workers(workers), command)
+    with folder.locked():
+        return build_ladder(folder, steps, ladder, default_workers(workers), command)

@@ -15,18 +15,26 @@ from __future__ import annotations
 
 import itertools
 import math
-import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from offbench.agents.ladder import MEDIUM, MEDIUM_AT_MOST, Ladder, read_ladder
+from offbench.agents.ladder import MEDIUM, MEDIUM_AT_MOST, Ladder, put_back, read_ladder, replaced_by
 from offbench.agents.medium_replay import replay_episodes, save_replay
 from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, csv_bytes, damage, disk_errors, read_json, write_bytes, write_json
+from offbench.common.files import (
+    JsonObject,
+    csv_bytes,
+    damage,
+    delete,
+    disk_errors,
+    read_json,
+    write_bytes,
+    write_json,
+)
 from offbench.common.provenance import PHYSICS, versions
 from offbench.common.seeds import Purpose
 from offbench.common.terminal import inform
@@ -280,7 +288,8 @@ def _write(out: Path, evaluator: RungEvaluator, roles: dict[int, str], info: Jso
     folder = evaluator.folder
     temporary = out.with_name(f".{out.name}.partial")
     with disk_errors(str(out)):
-        shutil.rmtree(temporary, ignore_errors=True)
+        put_back(out)
+        delete(temporary)
         (temporary / "policies").mkdir(parents=True)
         for step in roles:
             # rewritten, because policy files of earlier versions have no hash
@@ -290,12 +299,12 @@ def _write(out: Path, evaluator: RungEvaluator, roles: dict[int, str], info: Jso
             temporary / "medium-replay.hdf5", replay_episodes(folder, info["levels"]["medium"])
         )
         write_json(temporary / "ladder.json", info)
-        old = out.with_name(f".{out.name}.old")
-        shutil.rmtree(old, ignore_errors=True)
+        old = replaced_by(out)
+        delete(old)
         if out.exists():
             out.replace(old)
         temporary.replace(out)
-        shutil.rmtree(old, ignore_errors=True)
+        delete(old)
 
 
 def _table(evaluator: RungEvaluator, roles: dict[int, str]) -> Iterator[list[str | float]]:

@@ -7,6 +7,7 @@ Returns are of the sampling policy, normalized between the uniform-random and th
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import json
@@ -17,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, damage, read_json, regular
+from offbench.common.files import JsonObject, damage, disk_errors, exclusive_lock, read_json, regular
 from offbench.common.scores import LARGEST, are_references, normalize
 from offbench.common.settings import read_back
 from offbench.common.terminal import inform, warn
@@ -171,7 +172,11 @@ def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool =
         OffbenchError: it is damaged, or of another environment.
     """
     shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder and not retrain else None
-    ladder = shipped or read_ladder(folder_of(recipe, 0, behaviour_dir) / "ladder")
+    trained = folder_of(recipe, 0, behaviour_dir) / "ladder"
+    if not shipped and replaced_by(trained).exists():
+        with contextlib.suppress(OffbenchError), exclusive_lock(trained.parent / ".lock", str(trained)):
+            put_back(trained)
+    ladder = shipped or read_ladder(trained)
     if ladder is None:
         return None
     ladder.check(recipe)
@@ -180,6 +185,19 @@ def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool =
         _warn_other_recipe(ladder, recipe)
     warn_other_physics(f"the behaviour agent of {recipe.name}", ladder.info.versions, recipe.env_spec())
     return ladder
+
+
+def replaced_by(folder: Path) -> Path:
+    """Return where a ladder is while another one takes its place."""
+    return folder.with_name(f".{folder.name}.old")
+
+
+def put_back(folder: Path) -> None:
+    """Put back a ladder whose writer was killed between its two renames; the training's lock must be held."""
+    old = replaced_by(folder)
+    if not folder.exists() and (old / "ladder.json").is_file():
+        with disk_errors(str(folder)):
+            old.replace(folder)
 
 
 def _warn_other_recipe(ladder: Ladder, recipe: Recipe) -> None:

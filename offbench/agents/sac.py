@@ -40,9 +40,7 @@ from offbench.common.files import (
     JsonObject,
     csv_bytes,
     disk_errors,
-    exclusive_lock,
     read_json,
-    remove_leftovers,
     write_bytes,
     write_json,
 )
@@ -71,9 +69,7 @@ def train(folder: TrainingFolder, steps: int) -> None:
         OffbenchError: the folder belongs to another recipe or seed, is in use, or the disk refuses.
         KeyboardInterrupt: after Ctrl-C (or whatever SIGTERM raises), once a checkpoint is written.
     """
-    with exclusive_lock(folder.path / ".lock", f"{folder.path} is being trained"):
-        for written in (folder.path, folder.path / "policies", folder.path / "transitions"):
-            remove_leftovers(written)
+    with folder.locked():
         _check_identity(folder)
         if max(checkpoints.steps(folder.path), default=0) < steps:
             _train(folder, steps)

@@ -10,6 +10,8 @@ ladder/                     what `build_ladder` chose (unless `--out` says other
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +19,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import damage, read_text, regular
+from offbench.common.files import damage, exclusive_lock, read_text, regular, remove_leftovers
 from offbench.envs.recipes import Recipe
 
 TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -35,6 +37,14 @@ class TrainingFolder:
     def rungs(self) -> Path:
         """The screening returns of every rung."""
         return self.path / "rungs.csv"
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder for this process, rid of leftovers. Raises OffbenchError if another one trains there."""
+        with exclusive_lock(self.path / ".lock", f"{self.path} is being trained"):
+            for written in (self.path, self.path / "policies", self.path / "transitions"):
+                remove_leftovers(written)
+            yield
 
     def policy(self, step: int) -> Path:
         """The policy after `step` environment steps."""

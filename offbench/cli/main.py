@@ -6,12 +6,13 @@ import contextlib
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
 from offbench.cli import data, results, tools, training
 from offbench.cli.arguments import Command, Parser
-from offbench.common.errors import unknown
+from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import disk_errors
 from offbench.common.terminal import labeled
 from offbench.common.text import printable
@@ -255,14 +256,23 @@ def _terminable() -> Iterator[None]:
     def stop(*_: object) -> NoReturn:
         raise Terminated
 
+    def again(ignored: sys.UnraisableHookArgs) -> None:
+        if isinstance(ignored.exc_value, KeyboardInterrupt):
+            number = signal.SIGTERM if isinstance(ignored.exc_value, Terminated) else signal.SIGINT
+            threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
+        else:
+            hook(ignored)
+
     try:
         before = signal.signal(signal.SIGTERM, stop)
     except ValueError:  # only the main thread may
         yield
         return
+    hook, sys.unraisablehook = sys.unraisablehook, again  # a stop within `__del__` or a callback would be lost
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, before)
 
 
@@ -297,6 +307,10 @@ def _parser(words: list[str]) -> Parser:
 
 
 def _run(words: list[str]) -> None:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise OffbenchError("the current folder was deleted; change to another one") from None
     name = _command(words)
     if name is not None and name not in BY_NAME:
         raise unknown("command", name, BY_NAME)

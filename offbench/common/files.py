@@ -10,6 +10,7 @@ import io
 import json
 import os
 import re
+import secrets
 import shutil
 import socket
 import stat
@@ -69,8 +70,13 @@ def disk_errors(what: str, elsewhere: str = "choose another folder") -> Iterator
     try:
         yield
     except OSError as error:
-        if isinstance(error, FileNotFoundError | BrokenPipeError):
+        if isinstance(error, BrokenPipeError):
             raise
+        if isinstance(error, FileNotFoundError):
+            gone = error.filename or "its folder"
+            raise OffbenchError(
+                f"cannot write {what}: {gone} is missing, or was moved or deleted meanwhile; run the command again"
+            ) from error
         remedy = OPEN_FILES.get(error.errno) or f"{WRITE_REMEDIES.get(error.errno, '')}{elsewhere}"
         raise OffbenchError(f"cannot write {what}: {error.strerror or error}; {remedy}") from error
 
@@ -89,7 +95,6 @@ def exclusive_lock(path: Path, what: str, timeout: float = ORPHANS) -> Iterator[
     """
     from filelock import FileLock, Timeout  # here, so that help comes at once
 
-    path = path.absolute()
     lock, holder = FileLock(path), path.with_suffix(".holder")
     with disk_errors(str(path.parent)):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -106,12 +111,13 @@ def exclusive_lock(path: Path, what: str, timeout: float = ORPHANS) -> Iterator[
         yield
     finally:
         if _holds(path):  # else the holder file belongs to another process
-            holder.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                holder.unlink(missing_ok=True)
         _inodes.pop(path, None)
         lock.release()
 
 
-_inodes: dict[Path, int] = {}  # of the lock files that this process holds
+_inodes: dict[Path, int] = {}  # of the lock files that this process holds; a relative path may lead elsewhere later
 
 
 def _holds(lock: Path) -> bool:
@@ -125,12 +131,14 @@ def _holds(lock: Path) -> bool:
 def check_ownership(path: Path) -> None:
     """Check, before a write, that the lock files of this process at or above `path` still exist.
 
+    Args:
+        path: relative if the lock's path is.
+
     Raises:
         OffbenchError: a folder was moved, deleted or replaced while its lock was held.
     """
-    parents = path.absolute().parents
     for lock in _inodes:
-        if lock.parent in parents and not _holds(lock):
+        if lock.parent in path.parents and not _holds(lock):
             raise OffbenchError(
                 f"{lock.parent} was moved, deleted or replaced while this process was writing to it; "
                 "nothing more is written: move it back and rerun the command to resume, or start over"
@@ -164,27 +172,31 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
     try:
         for path, data in contents.items():
             check_ownership(path)
-            asides[path] = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+            asides[path] = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
             with disk_errors(str(path)):
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with open(asides[path], "wb") as file:
+                with open(asides[path], "xb") as file:
                     file.write(data)
                     file.flush()
                     os.fsync(file.fileno())
         for path, aside in asides.items():
             with disk_errors(str(path)):
                 os.replace(aside, path)
-    except BaseException:
+    except BaseException as error:
         for aside in asides.values():
             with contextlib.suppress(OSError):
                 aside.unlink(missing_ok=True)
+        if isinstance(error, OffbenchError):
+            for path in contents:
+                check_ownership(path)  # if that is why
         raise
 
 
 def remove_leftovers(folder: Path) -> None:
     """Delete the unfinished files of killed processes in `folder`, whose lock must be held."""
     for leftover in folder.glob(".*.tmp"):
-        delete(leftover)
+        with disk_errors(str(leftover)):
+            delete(leftover)
 
 
 def delete(path: Path) -> None:

@@ -1,11 +1,16 @@
-"""HDF5 on a disk that may be full: libhdf5 crashes the process if a write fails while it closes a file."""
+"""HDF5 files written through callbacks that never raise, because libhdf5 can crash the process if one does.
+
+Errors (a full disk) and stops (Ctrl-C, SIGTERM) are noted there, and raised between writes.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+from offbench.common.interrupts import stops_noted
 
 
 class SafeFile:
@@ -13,16 +18,22 @@ class SafeFile:
 
     The first error is kept and later writes are dropped; `check` raises it. The writer calls `check` now and then, and
     at the end.
+
+    Args:
+        stops: the signals that `stops_noted` collects.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, stops: Sequence[int] = ()) -> None:
+        self._stops = stops
         self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by `close`)
         self._error: OSError | None = None
 
     def check(self) -> None:
-        """Raise the error of a failed write, if there was one."""
+        """Raise the error of a failed write if there was one, and KeyboardInterrupt if the process is to stop."""
         if self._error is not None:
             raise self._error
+        if self._stops:
+            raise KeyboardInterrupt  # `stops_noted` raises what belongs to the signal at its end
 
     def write(self, data: bytes | memoryview) -> int:
         """Write, or keep the error."""
@@ -77,11 +88,12 @@ class SafeFile:
 @contextlib.contextmanager
 def safe_file(path: Path) -> Iterator[SafeFile]:
     """Open a new file for libhdf5. Raises OSError at the end if a write failed."""
-    file = SafeFile(path)
-    try:
-        yield file
-    except BaseException:
-        with contextlib.suppress(OSError):
-            file.close()
-        raise
-    file.close()
+    with stops_noted() as stops:
+        file = SafeFile(path, stops)
+        try:
+            yield file
+        except BaseException:
+            with contextlib.suppress(OSError, KeyboardInterrupt):
+                file.close()
+            raise
+        file.close()

@@ -23,6 +23,7 @@ from offbench.data import minari_store
 from offbench.data.behaviour_policy import BehaviourPolicy, level_name, read_behaviour_policy
 from offbench.data.card import compare
 from offbench.data.levels import Part, full_size, parse_level, parse_mix, shares
+from offbench.data.minari_reader import open_minari
 from offbench.data.other_references import warn_other_references
 from offbench.envs.contact_margins import model_of
 from offbench.envs.environments import make_env, spaces_of
@@ -130,11 +131,18 @@ def collect(
 
 
 def _is_same(dataset_id: str, wanted: JsonObject) -> bool:
-    """Return whether a dataset was recorded from what `wanted`, its metadata to be, says, on this physics."""
+    """Return whether a dataset was recorded from what `wanted`, its metadata to be, says, on this physics.
+
+    Raises:
+        DamagedError: its data cannot be opened.
+    """
     recorded = minari_store.provenance(minari_store.read_metadata(dataset_id))
     ours = minari_store.provenance(json.loads(json.dumps({minari_store.KEY: wanted[minari_store.KEY]})))  # as written
     same = all(recorded.versions.get(name) == ours.versions.get(name) for name in PHYSICS)
-    return same and all(getattr(recorded, key) == getattr(ours, key) for key in IDENTITY)
+    same = same and all(getattr(recorded, key) == getattr(ours, key) for key in IDENTITY)
+    if same:
+        open_minari(dataset_id)
+    return same
 
 
 def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:

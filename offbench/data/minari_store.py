@@ -17,7 +17,17 @@ import numpy.typing as npt
 from filelock import FileLock, Timeout
 
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
-from offbench.common.files import ORPHANS, JsonObject, damage, delete, disk_errors, exclusive_lock, read_json
+from offbench.common.files import (
+    ORPHANS,
+    JsonObject,
+    check_ownership,
+    damage,
+    delete,
+    disk_errors,
+    exclusive_lock,
+    read_json,
+    write_bytes,
+)
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.scores import are_references
 from offbench.common.settings import read_back, setting
@@ -236,7 +246,7 @@ def _beside(path: Path, ending: str) -> Path:
     return path.with_name(f".offbench-{path.name}.{ending}")
 
 
-OLD = re.compile(r"\.offbench-(.+)\.old")  # of `_beside`
+OLD = re.compile(r"\.offbench-([^.].*)\.old")  # of `_beside`
 
 
 def _put_back(path: Path) -> bool:
@@ -309,6 +319,7 @@ def write(
     """
     env_spec = parse_spec(spec) if spec else None
     aside = _beside(path, "partial")
+    check_ownership(aside)
     with disk_errors(str(path)):
         (aside / "data").mkdir(parents=True)
         try:
@@ -318,7 +329,8 @@ def write(
             _check_room(aside, storage, steps)
             content, dtype = ContentHash(), storage.observation_space.dtype
             with safe_file(storage._file_path) as storage._file_path:  # so that a full disk is no crash
-                storage.update_episodes(_buffers(episodes, dtype, content, storage._file_path))
+                storage.update_episodes(_buffers(episodes, dtype, content, storage._file_path, aside))
+            check_ownership(aside)
             if not storage.total_steps:
                 raise OffbenchError("there are no transitions to write")
             if expected not in (None, content.hexdigest()):
@@ -328,6 +340,7 @@ def write(
             ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
             storage.update_metadata(metadata | {KEY: ours})
             _write_namespaces(path)
+            check_ownership(aside)
             if path.exists():
                 path.replace(_beside(path, "old"))
             aside.replace(path)
@@ -336,7 +349,9 @@ def write(
                 raise
             raise OffbenchError(f"{aside} was moved or deleted while it was written; run the command again") from error
         finally:
-            _recover(path)
+            with contextlib.suppress(OffbenchError):  # the folder is no longer this process's, or the disk refuses
+                check_ownership(aside)
+                _recover(path)
     return content.hexdigest()
 
 
@@ -345,24 +360,28 @@ def _write_namespaces(path: Path) -> None:
     for parent in path.relative_to(root()).parents[:-1]:
         file = root() / parent / "namespace_metadata.json"
         if not file.exists():
-            file.write_text("{}", encoding="utf-8")
+            write_bytes(file, b"{}")
 
 
 def _recover(path: Path) -> None:
     """Put the replaced dataset back if the new one did not make it, else delete it; delete what is half written."""
-    old = _beside(path, "old")
-    if old.exists() and not path.exists():
-        old.replace(path)
-    for left in (old, _beside(path, "partial")):
-        with contextlib.suppress(OSError):
-            delete(left)
+    old, partial = _beside(path, "old"), _beside(path, "partial")
+    with disk_errors(str(partial)):
+        delete(partial)
+    with disk_errors(str(old)):
+        if not path.exists() and not old.is_symlink() and (old / "data" / "metadata.json").is_file():
+            old.replace(path)
+        elif os.path.lexists(old):
+            old.replace(partial)  # a killed process must not leave half of it as a dataset to put back
+            delete(partial)
 
 
 def _buffers(
-    episodes: Iterable[Episode], dtype: npt.DTypeLike, content: ContentHash, file: SafeFile
+    episodes: Iterable[Episode], dtype: npt.DTypeLike, content: ContentHash, file: SafeFile, folder: Path
 ) -> Iterator[EpisodeBuffer]:
     for episode in episodes:
         file.check()
+        check_ownership(folder)
         observations = episode.observations.astype(dtype, copy=False)
         flags = np.zeros((2, len(episode)), bool)
         flags[:, -1] = episode.terminated, episode.truncated

@@ -26,7 +26,16 @@ from filelock import FileLock, Timeout
 
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError
-from offbench.common.files import JsonObject, damage, delete, disk_errors, read_json, read_text, write_json
+from offbench.common.files import (
+    JsonObject,
+    damage,
+    delete,
+    disk_errors,
+    read_json,
+    read_text,
+    remove_leftovers,
+    write_json,
+)
 from offbench.common.progress import Progress
 from offbench.common.terminal import warn
 from offbench.data import minari_store
@@ -169,7 +178,10 @@ def _mapped(folder: Path, sources: Mapping[str, Path]) -> tuple[str, dict[str, A
     except (FileNotFoundError, DamagedError):
         return None
     if files != meta["files"]:
-        with contextlib.suppress(OffbenchError):  # on a read-only disk they are hashed each time
+        lock = FileLock(folder.with_name(f"{folder.name}.lock"))
+        # on a read-only disk they are hashed each time
+        with contextlib.suppress(OffbenchError, OSError, Timeout), lock.acquire(timeout=0):
+            remove_leftovers(folder)
             write_json(folder / "meta.json", meta | {"files": files})
     return content, arrays
 
@@ -248,7 +260,10 @@ def _forget(source: str) -> None:
     for meta in cache().glob("*/meta.json"):
         with contextlib.suppress(OffbenchError):  # of another dataset, and damaged
             if read_json(meta).get("source") == source:
-                shutil.rmtree(meta.parent, ignore_errors=True)
+                aside = meta.parent.with_name(f".{meta.parent.name}.old")  # which `_remove_leftovers` knows
+                with contextlib.suppress(OSError):
+                    meta.parent.replace(aside)
+                    shutil.rmtree(aside)
 
 
 def _remove_leftovers(folder: Path) -> None:

@@ -100,7 +100,8 @@ def similarity(
         100 * float((distance <= action_tolerance).float().mean()),
         action_tolerance,
     )
-    write_json(_file(run), dataclasses.asdict(score))
+    with run.locked():
+        write_json(_file(run), dataclasses.asdict(score))
     return score
 
 

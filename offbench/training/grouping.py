@@ -132,7 +132,7 @@ def _alike(specs: Sequence[RunSpec], datasets: Datasets) -> list[list[RunSpec]]:
 def check_folders(job: Job, datasets: Datasets) -> None:
     """Check that the runs' folders can be claimed, before any of them is. Raises OffbenchError if one cannot."""
     for spec in job.specs:
-        spec.run.check(_run_config(spec, datasets[spec.dataset], job.device, ""))
+        spec.run.check(run_config(spec, datasets[spec.dataset], job.device, ""))
 
 
 def pending(job: Job, datasets: Datasets, *, command: str = "") -> list[Job]:
@@ -146,7 +146,7 @@ def pending(job: Job, datasets: Datasets, *, command: str = "") -> list[Job]:
     """
     for spec in job.specs:
         data = datasets[spec.dataset]
-        spec.run.claim(_run_config(spec, data, job.device, command))
+        spec.run.claim(run_config(spec, data, job.device, command))
         _check_environment(spec, data)
         if data.env_spec:
             _check_evaluations(spec)
@@ -202,7 +202,8 @@ def _check_evaluations(spec: RunSpec) -> None:
         )
 
 
-def _run_config(spec: RunSpec, data: Transitions, device: str, command: str) -> RunConfig:
+def run_config(spec: RunSpec, data: Transitions, device: str, command: str) -> RunConfig:
+    """Return what config.json says of a run that is started now."""
     return RunConfig(
         algorithm=spec.algorithm,
         variant=spec.variant,

@@ -185,6 +185,11 @@ class Run:
         if self._has_results and (reason := self._refusal(config)):
             raise OffbenchError(f"{reason}; {TRAIN_ANEW}")
 
+    def check_claimed(self, config: RunConfig) -> None:
+        """Check, with the lock held, that this is the run of `config`. Raises OffbenchError if it is not."""
+        if reason := self._refusal(config):
+            raise OffbenchError(f"{reason}; it was changed since the training was started: run the command again")
+
     def claim(self, config: RunConfig) -> None:
         """Write config.json, unless this very run is there.
 
@@ -233,12 +238,14 @@ class Run:
         return f"{self.folder} was trained by other code of {config.algorithm}: {changed}" if changed else ""
 
     def clear(self) -> None:
-        """Delete what the folder holds, if it holds a run, so that it is trained again."""
+        """Delete what the folder holds, if it holds a run, so that it is trained again; config.json goes last."""
         if self.config_path.exists():
             with self.locked():
-                for path in self.folder.iterdir():
-                    if path.name != ".lock":
-                        delete(path)
+                # what a killed process leaves must not be taken for a finished run
+                early = [self.folder / "similarity.json", *self.folder.glob("checkpoint-*")]
+                late = {*self.folder.iterdir()} - {*early, self.config_path, self.folder / ".lock"}
+                for path in (*early, *late, self.config_path):
+                    delete(path)
 
     def begin(self, step: int, steps: int, made: MadeWith) -> None:
         """Note in config.json that the run is trained from `step` to `steps`, and with what, if that has changed.

@@ -16,7 +16,8 @@ from concurrent.futures import Future
 import numpy as np
 
 from offbench.common import checkpoints
-from offbench.common.files import JsonObject, disk_errors
+from offbench.common.errors import OffbenchError
+from offbench.common.files import JsonObject, check_ownership, disk_errors, read_bytes
 from offbench.common.interrupts import stops_noted
 from offbench.common.provenance import made_with
 from offbench.common.scores import normalize
@@ -24,6 +25,7 @@ from offbench.common.seeds import Purpose
 from offbench.common.terminal import inform
 from offbench.data.transitions import Transitions
 from offbench.rollouts.rollouts import Outcome, Rollouts, gathered
+from offbench.training.grouping import run_config
 from offbench.training.loggers import Loggers
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run
@@ -58,6 +60,7 @@ class Trainer:
         self.rollouts: Rollouts | None = None
         self.note = ""
         self.diverged: dict[int, str] = {}  # runs that have diverged, and what to tell the user
+        self.configs: list[bytes] = []  # each run's config.json
         self.stops: list[int] = []  # signals received: Ctrl-C and SIGTERM
         self._saved, self._save_seconds = time.monotonic(), 0.0  # when the last checkpoint was written, and how fast
 
@@ -75,13 +78,17 @@ class Trainer:
             self.stops = resources.enter_context(stops_noted(second_at_once=True))
             for run in self.runs:
                 resources.enter_context(run.locked())
+            for run, spec, data in zip(self.runs, self.job.specs, self.stack.data, strict=True):
+                run.check_claimed(run_config(spec, data, self.job.device, ""))
+                checkpoints.keep_newest(run.folder)  # a killed process may have left one more
             self._resume()
             for run in self.runs:
                 run.begin(self.stack.step, steps, self.made)
+            self.configs = [read_bytes(run.config_path) for run in self.runs]
             resources.enter_context(self.loggers)
-            spec = self.stack.data[0].env_spec  # datasets of one stack are of one environment
-            if spec:
-                self.rollouts = resources.enter_context(Rollouts(spec, self.job.workers))
+            env_spec = self.stack.data[0].env_spec  # datasets of one stack are of one environment
+            if env_spec:
+                self.rollouts = resources.enter_context(Rollouts(env_spec, self.job.workers))
             report(self.stack.step, "")
             if self._evaluates_at(self.stack.step) and self.stack.step:
                 self._evaluate()
@@ -173,6 +180,7 @@ class Trainer:
         step = self.stack.step
         tensors = {name: tensor.detach().cpu() for name, tensor in self.stack.tensors().items()}
         for i, run in self._active():
+            self._check_config(i)
             with disk_errors(str(run.folder)):
                 run.write_evaluations(self.evaluations[i])
                 run.write_losses(self.losses[i])
@@ -186,6 +194,18 @@ class Trainer:
         self._show()
         self._saved = time.monotonic()
         self._save_seconds = self._saved - began
+
+    def _check_config(self, i: int) -> None:
+        """Check that a run's config.json is still there and the same, as its results mean nothing without it."""
+        path = self.runs[i].config_path
+        check_ownership(path)
+        with contextlib.suppress(OSError):
+            if read_bytes(path) == self.configs[i]:
+                return
+        raise OffbenchError(
+            f"{path} was deleted or changed during the training; put it back and rerun the command to resume from the "
+            "last checkpoint"
+        )
 
     def _show(self) -> None:
         """Send what the last checkpoint keeps to the live views."""
