@@ -12,14 +12,14 @@ from pathlib import Path
 from offbench.agents.build_ladder import random_reference
 from offbench.agents.ladder import BEHAVIOUR, MEDIUM, MEDIUM_AT_MOST, MEDIUM_LIMITS, NEAR, Ladder, Rung, find_ladder
 from offbench.agents.medium_replay import load_replay
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import JsonObject, sha256
 from offbench.common.processes import default_workers
 from offbench.common.progress import Progress
 from offbench.common.provenance import PHYSICS, versions
 from offbench.common.seeds import check_seed
 from offbench.common.terminal import inform
-from offbench.data import minari_store
+from offbench.data import minari_store, minari_writer
 from offbench.data.behaviour_policy import BehaviourPolicy, level_name, read_behaviour_policy
 from offbench.data.card import compare
 from offbench.data.levels import Part, full_size, parse_level, parse_mix, shares
@@ -122,7 +122,7 @@ def collect(
         with Progress(total, f"recording {dataset_id}") as progress:
             streams = (recording.episodes(*item) for item in zip(parts, sources, counts, itertools.count()))
             episodes = _counted(itertools.chain.from_iterable(streams), progress)
-            content = minari_store.write(path, episodes, recording.spec, metadata, total, recording.spaces)
+            content = minari_writer.write(path, episodes, recording.spec, metadata, total, recording.spaces)
     if seed == 0 and steps is None and not retrain and (said := compare(recipe, name, content)):
         inform(said)
     if ladder:
@@ -141,7 +141,10 @@ def _is_same(dataset_id: str, wanted: JsonObject) -> bool:
     same = all(recorded.versions.get(name) == ours.versions.get(name) for name in PHYSICS)
     same = same and all(getattr(recorded, key) == getattr(ours, key) for key in IDENTITY)
     if same:
-        open_minari(dataset_id)
+        try:
+            open_minari(dataset_id)
+        except DamagedError as error:
+            raise DamagedError(f"{error}: --overwrite replaces it") from error
     return same
 
 

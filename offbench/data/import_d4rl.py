@@ -31,7 +31,7 @@ from offbench.common.files import JsonObject, damage, sha256_of
 from offbench.common.progress import Progress
 from offbench.common.provenance import versions
 from offbench.common.terminal import inform, warn
-from offbench.data import minari_store
+from offbench.data import minari_store, minari_writer
 from offbench.data.d4rl_file import NUMBERS, SEEDS, Source, read_source
 from offbench.data.minari_reader import flags
 from offbench.envs.environments import Space, box, make_env, parse_spec, spaces_of, time_limit
@@ -84,7 +84,7 @@ def import_d4rl(file: str | Path, dataset_id: str, *, env: str | None = None, ov
             ):
                 content = metadata[minari_store.KEY].get("content_sha256")
                 episodes = _episodes(source, ends, bar)
-                minari_store.write(folder, episodes, origin.recorded, metadata, len(source), spaces, content)
+                minari_writer.write(folder, episodes, origin.recorded, metadata, len(source), spaces, content)
     except FileNotFoundError as error:
         raise OffbenchError(f"{error.filename or path} is gone; run the command again") from None
     return dataset_id

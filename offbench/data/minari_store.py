@@ -1,4 +1,4 @@
-"""Minari datasets on disk: written aside and renamed, so that an id never names half a dataset."""
+"""Minari datasets on disk: their ids, metadata and locks."""
 
 from __future__ import annotations
 
@@ -6,43 +6,32 @@ import contextlib
 import json
 import os
 import re
-import shutil
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 from filelock import FileLock, Timeout
 
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
 from offbench.common.files import (
     ORPHANS,
     JsonObject,
-    check_ownership,
     damage,
     delete,
     disk_errors,
     exclusive_lock,
     read_json,
-    write_bytes,
 )
-from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.scores import are_references
 from offbench.common.settings import read_back, setting
-from offbench.data.content_hash import ContentHash
 from offbench.data.levels import parse_level, recipe_and_level
-from offbench.envs.environments import Space, parse_spec
 from offbench.envs.margin_rule import ADDED, EARLIER
 from offbench.envs.recipes import load_recipe
-from offbench.rollouts.rollouts import Episode
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
-    from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_dataset import parse_dataset_id
-    from minari.dataset.minari_storage import MinariStorage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +66,6 @@ class Provenance:
 
 
 KEY = "offbench"  # under which all that Minari has no field for is kept in the metadata
-BYTES_PER_EPISODE = 14_000  # what HDF5 needs in addition to the numbers, measured on short episodes
 
 
 def root() -> Path:
@@ -125,7 +113,7 @@ def _absent(dataset_id: str) -> OffbenchError:
         what = "a file, not a dataset's id; `offbench import-d4rl` converts D4RL's HDF5 files"
         return OffbenchError(f"{dataset_id} is {what}")
     path = root() / dataset_id
-    if _inside(dataset_id) and os.path.lexists(old := _beside(path, "old")):
+    if _inside(dataset_id) and os.path.lexists(old := beside(path, "old")):
         why = "its replacement was interrupted, and it could not be put back"
         return OffbenchError(f"{dataset_id} is not there: {why}; rename {old} to {path}")
     if os.path.isfile(os.path.join(dataset_id, "data", "metadata.json")):
@@ -232,7 +220,7 @@ def being_recorded(dataset_id: str) -> bool:
     """Whether another process holds a dataset id for writing."""
     path = path_of(dataset_id)
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(_beside(path, "lock"))
+    lock = FileLock(beside(path, "lock"))
     try:
         lock.acquire(timeout=0)
     except Timeout:
@@ -241,17 +229,17 @@ def being_recorded(dataset_id: str) -> bool:
     return False
 
 
-def _beside(path: Path, ending: str) -> Path:
+def beside(path: Path, ending: str) -> Path:
     """Return a hidden path beside a dataset: its `lock`, `partial` while it is written, `old` while it is replaced."""
     return path.with_name(f".offbench-{path.name}.{ending}")
 
 
-OLD = re.compile(r"\.offbench-([^.].*)\.old")  # of `_beside`
+OLD = re.compile(r"\.offbench-([^.].*)\.old")  # of `beside`
 
 
 def _put_back(path: Path) -> bool:
     """Put back a dataset whose writer was killed between the two renames of `write`; return whether it is there."""
-    if os.path.lexists(_beside(path, "old")):
+    if os.path.lexists(beside(path, "old")):
         _tidy(path, ORPHANS)
     return path.exists()
 
@@ -267,9 +255,9 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     path = path_of(dataset_id)
     if not path.parent.resolve().is_relative_to(root().resolve()):
         raise OffbenchError(f"{dataset_id} leads out of {root()} by a link; choose another id")
-    with exclusive_lock(_beside(path, "lock"), f"{dataset_id} is being recorded"):
+    with exclusive_lock(beside(path, "lock"), f"{dataset_id} is being recorded"):
         with disk_errors(str(path)):
-            _recover(path)
+            recover(path)
         if path.exists() and not overwrite:
             message = f"{dataset_id} exists already{_size(dataset_id)}"
             raise OffbenchError(f"{message}; use --overwrite to replace it, or --id for another id")
@@ -292,80 +280,15 @@ def tidy(dataset_id: str) -> None:
 def _tidy(path: Path, timeout: float) -> None:
     with (
         contextlib.suppress(OffbenchError),
-        exclusive_lock(_beside(path, "lock"), path.name, timeout),
+        exclusive_lock(beside(path, "lock"), path.name, timeout),
         disk_errors(str(path)),
     ):
-        _recover(path)
+        recover(path)
 
 
-def write(
-    path: Path,
-    episodes: Iterable[Episode],
-    spec: str | None,
-    metadata: JsonObject,
-    steps: int,
-    spaces: tuple[Space, Space],
-    expected: str | None = None,
-) -> str:
-    """Write episodes as a Minari HDF5 dataset at `path`, whole or not at all; return the content hash.
-
-    Args:
-        path: the folder of a claimed id; what is there is replaced at the last moment.
-        spec: the environment's EnvSpec as JSON, None if unknown.
-        metadata: Minari's fields; the content hash joins those under the key `offbench`.
-        steps: transitions to come, to see beforehand whether the disk has room.
-        spaces: of observations and actions; Minari would otherwise make the environment, which may no longer exist.
-        expected: the content hash that the data must have (None: any).
-    """
-    env_spec = parse_spec(spec) if spec else None
-    aside = _beside(path, "partial")
-    check_ownership(aside)
-    with disk_errors(str(path)):
-        (aside / "data").mkdir(parents=True)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                storage = MinariStorage.new(aside / "data", *spaces, env_spec, "hdf5")
-            _check_room(aside, storage, steps)
-            content, dtype = ContentHash(), storage.observation_space.dtype
-            with safe_file(storage._file_path) as storage._file_path:  # so that a full disk is no crash
-                storage.update_episodes(_buffers(episodes, dtype, content, storage._file_path, aside))
-            check_ownership(aside)
-            if not storage.total_steps:
-                raise OffbenchError("there are no transitions to write")
-            if expected not in (None, content.hexdigest()):
-                raise OffbenchError(
-                    "the data are not those that were exported (their hash differs); export them again"
-                )
-            ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
-            storage.update_metadata(metadata | {KEY: ours})
-            _write_namespaces(path)
-            check_ownership(aside)
-            if path.exists():
-                path.replace(_beside(path, "old"))
-            aside.replace(path)
-        except Exception as error:  # Minari raises a ValueError for a missing folder, for example
-            if aside.exists():
-                raise
-            raise OffbenchError(f"{aside} was moved or deleted while it was written; run the command again") from error
-        finally:
-            with contextlib.suppress(OffbenchError):  # the folder is no longer this process's, or the disk refuses
-                check_ownership(aside)
-                _recover(path)
-    return content.hexdigest()
-
-
-def _write_namespaces(path: Path) -> None:
-    """Write the metadata of a dataset's namespaces where there are none, which `minari upload` needs."""
-    for parent in path.relative_to(root()).parents[:-1]:
-        file = root() / parent / "namespace_metadata.json"
-        if not file.exists():
-            write_bytes(file, b"{}")
-
-
-def _recover(path: Path) -> None:
+def recover(path: Path) -> None:
     """Put the replaced dataset back if the new one did not make it, else delete it; delete what is half written."""
-    old, partial = _beside(path, "old"), _beside(path, "partial")
+    old, partial = beside(path, "old"), beside(path, "partial")
     with disk_errors(str(partial)):
         delete(partial)
     with disk_errors(str(old)):
@@ -374,38 +297,3 @@ def _recover(path: Path) -> None:
         elif os.path.lexists(old):
             old.replace(partial)  # a killed process must not leave half of it as a dataset to put back
             delete(partial)
-
-
-def _buffers(
-    episodes: Iterable[Episode], dtype: npt.DTypeLike, content: ContentHash, file: SafeFile, folder: Path
-) -> Iterator[EpisodeBuffer]:
-    for episode in episodes:
-        file.check()
-        check_ownership(folder)
-        observations = episode.observations.astype(dtype, copy=False)
-        flags = np.zeros((2, len(episode)), bool)
-        flags[:, -1] = episode.terminated, episode.truncated
-        content.add(observations, episode.actions, episode.rewards, *flags)
-        yield EpisodeBuffer(
-            id=None,
-            seed=episode.seed if episode.seed >= 0 else None,
-            observations=observations,
-            actions=episode.actions,
-            rewards=episode.rewards,
-            terminations=flags[0],
-            truncations=flags[1],
-            infos=None,
-        )
-
-
-def _check_room(folder: Path, storage: MinariStorage, steps: int) -> None:
-    """Refuse to begin what the disk cannot hold (episodes of 100 steps assumed)."""
-    width = storage.observation_space.shape[0] * storage.observation_space.dtype.itemsize
-    width += storage.action_space.shape[0] * 4 + 10
-    need = steps * width + steps // 100 * BYTES_PER_EPISODE
-    free = shutil.disk_usage(folder).free
-    if free < need:
-        raise OffbenchError(
-            f"not enough room in {root()}: {need / 1e6:.0f} MB needed, {free / 1e6:.0f} MB free; "
-            "free some, set MINARI_DATASETS_PATH to another disk, or record fewer --steps"
-        )

@@ -19,7 +19,7 @@ import pytest
 import offbench
 from offbench.cli.main import main
 from offbench.common import files
-from offbench.data import file_stamps, minari_store, transitions
+from offbench.data import file_stamps, minari_store, minari_writer, transitions
 from offbench.data.minari_reader import episodes_of, open_minari
 from offbench.rollouts.policy import uniform
 from tests.cli.test_bad_input import refusal
@@ -235,7 +235,7 @@ def test_a_dataset_deleted_while_it_is_recorded(
     words = ["collect", "inverted-pendulum", "--level", "random", "--steps", "300", "--seed", "1", "--workers", "1"]
     words += overwrite or ["--id", "new-v0"]
     with monkeypatch.context() as patched:
-        patched.setattr(minari_store, "_check_room", lambda folder, *_: shutil.rmtree(folder))
+        patched.setattr(minari_writer, "_check_room", lambda folder, *_: shutil.rmtree(folder))
         assert "was moved or deleted while it was written" in refusal(words, capsys)
     assert minari_store.local_ids() == [recorded]
     main(words)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from offbench.common.provenance import versions
-from offbench.data import minari_store
+from offbench.data import minari_store, minari_writer
 from offbench.envs.environments import env_spec, make_env
 from offbench.rollouts.rollouts import Episode
 from offbench.verification.verify import verify
@@ -50,7 +50,7 @@ def recorded(
 
     metadata = {"dataset_id": name, "minari_version": versions()["minari"], "offbench": {"versions": versions()}}
     with minari_store.claimed(name, False) as path:
-        minari_store.write(path, episodes(), spec, metadata, 1000, (env.observation_space, env.action_space))
+        minari_writer.write(path, episodes(), spec, metadata, 1000, (env.observation_space, env.action_space))
     return name
 
 
