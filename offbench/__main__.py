@@ -1,6 +1,16 @@
 """`python -m offbench` is `offbench`."""
 
-from offbench.cli.main import main
+import sys
+
+
+def main() -> None:
+    """Run one command; see offbench.cli.main."""
+    try:
+        from offbench.cli.main import main as run
+    except KeyboardInterrupt:  # while it is imported
+        sys.exit(130)
+    run()
+
 
 if __name__ == "__main__":
     main()

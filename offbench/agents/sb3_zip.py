@@ -20,7 +20,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, regular
+from offbench.common.files import JsonObject, damage, regular
 from offbench.rollouts.policy import ACTIVATIONS, Layers, Policy
 
 LARGEST = 2**30  # bytes of a member, unpacked
@@ -37,14 +37,10 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
             observations that VecNormalize has normalized.
     """
     try:
-        tensors, settings = _read(path)
+        with damage(str(path), "is not a readable zip of Stable-Baselines3", "save the agent again"):
+            tensors, settings = _read(path)
     except FileNotFoundError:
         raise OffbenchError(f"no file {path}") from None
-    except (ValueError, KeyError, TypeError, EOFError, OSError, RuntimeError, zipfile.BadZipFile) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise OffbenchError(f"{path} is not a readable zip of Stable-Baselines3: {reason}") from None
-    except (pickle.UnpicklingError, RecursionError):
-        raise OffbenchError(f"{path} is refused: its policy.pth holds more than tensors") from None
     if settings.get("use_sde") is True:
         raise OffbenchError(f"{path} uses gSDE exploration, which offbench does not play")
     kind, layers, algorithm, default = _layers(path, tensors)
@@ -64,7 +60,12 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
 
 
 def _read(path: Path) -> tuple[dict[str, Array], JsonObject]:
-    """Return the tensors of policy.pth and the plain settings of data. Raises what zipfile and torch raise."""
+    """Return the tensors of policy.pth and the plain settings of data.
+
+    Raises:
+        OffbenchError: policy.pth holds more than tensors.
+        Exception: whatever zipfile and torch raise for damaged bytes.
+    """
     import torch
 
     with open(path, "rb", opener=regular) as file, zipfile.ZipFile(file) as archive:
@@ -73,7 +74,10 @@ def _read(path: Path) -> tuple[dict[str, Array], JsonObject]:
                 raise ValueError(f"{name} is larger than {LARGEST:,} bytes")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of old formats: what they hold is checked below
-            weights = torch.load(io.BytesIO(archive.read("policy.pth")), map_location="cpu", weights_only=True)
+            try:
+                weights = torch.load(io.BytesIO(archive.read("policy.pth")), map_location="cpu", weights_only=True)
+            except (pickle.UnpicklingError, RecursionError):
+                raise OffbenchError(f"{path} is refused: its policy.pth holds more than tensors") from None
         settings = json.loads(archive.read("data"))
     if not isinstance(weights, Mapping) or not isinstance(settings, dict):
         raise ValueError("its policy.pth or data are not what SB3 writes")

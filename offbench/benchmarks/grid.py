@@ -24,14 +24,13 @@ from pathlib import Path
 
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import JsonObject, damage, read_text
-from offbench.common.settings import build
-from offbench.common.text import LARGEST
+from offbench.common.settings import build, shown
+from offbench.common.text import LARGEST, MOST_SEEDS
 from offbench.data import minari_store
 from offbench.data.levels import parse_level, recipe_and_level
 from offbench.envs.recipes import load_recipe
 from offbench.training.spec import Times
 
-MOST_SEEDS = 100_000  # a larger count is a typing error, and would fill the memory
 LONGEST_LABEL = 60
 
 
@@ -124,7 +123,7 @@ def _times(values: JsonObject, default: Times, where: str) -> Times:
         seeds = range(seeds)
     bad = not isinstance(seeds, Sequence) or any(type(s) is not int or not 0 <= s <= LARGEST for s in seeds)
     if bad or len(set(seeds)) != len(seeds) or not len(seeds):
-        raise OffbenchError(f"{where}: seeds must be a count or a list of different whole numbers, not {seeds!r}")
+        raise OffbenchError(f"{where}: seeds must be a count or a list of different whole numbers, not {shown(seeds)}")
     return build(Times, merged | {"seeds": tuple(seeds)}, where)
 
 
@@ -138,7 +137,7 @@ def _source(value: object, folder: Path, where: str) -> Source:
         env = str(beside) if source.env.endswith(".toml") and beside.is_file() else source.env
         return dataclasses.replace(source, env=env, level=source.level or ("medium" if env else ""))
     if not isinstance(value, str):
-        raise OffbenchError(f"{where}: datasets must be ids or tables, not {value!r}")
+        raise OffbenchError(f"{where}: datasets must be ids or tables, not {shown(value)}")
     env, level = recipe_and_level(minari_store.check_id(value))
     if env and value.rpartition("-v")[2] != str(load_recipe(env).version):
         return Source(value)  # of another version, such as one of D4RL's: it can be used but not recorded
@@ -153,11 +152,13 @@ def _entry(value: object, times: Times, ids: Sequence[str], folder: Path, where:
     changed = _times({key: item for key, item in value.items() if key in own}, times, entry)
     label = value.get("label", "")
     if not isinstance(label, str) or len(label) > LONGEST_LABEL or not label.isprintable():
-        raise OffbenchError(f"{entry}: label must be a line of at most {LONGEST_LABEL} characters, not {label!r:.80}")
+        raise OffbenchError(f"{entry}: label must be a line of at most {LONGEST_LABEL} characters, not {shown(label)}")
     patterns = value.get("datasets", ["*"])
     for pattern in _list(patterns, "datasets", entry):
         if not isinstance(pattern, str) or not fnmatch.filter(ids, pattern):
-            raise OffbenchError(f"{entry}: no dataset of this grid matches {pattern!r}; there are {', '.join(ids)}")
+            raise OffbenchError(
+                f"{entry}: no dataset of this grid matches {shown(pattern)}; there are {', '.join(ids)}"
+            )
     datasets = tuple(name for name in ids if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns))
     settings = {key: item for key, item in value.items() if key not in own | {"name", "label", "datasets"}}
     name = value["name"]

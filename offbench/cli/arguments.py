@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 from offbench.common.errors import OffbenchError, nearest
 from offbench.common.terminal import is_terminal
-from offbench.common.text import LARGEST, whole_number
+from offbench.common.text import LARGEST, MOST_SEEDS, whole_number
 
 HELP_COLUMN = 28  # where the help of an argument begins, at the latest, on a terminal of 80 columns
 
@@ -200,9 +200,11 @@ def seed_list(text: str) -> list[int]:
     """Return the seeds of `3`, `0,1,2` or `0:5` (the end is left out, as in Python)."""
     first, colon, last = text.partition(":")
     try:
-        seeds = list(range(natural(first), natural(last))) if colon else [natural(part) for part in text.split(",")]
+        seeds = range(natural(first), natural(last)) if colon else [natural(part) for part in text.split(",")]
     except argparse.ArgumentTypeError as error:
         raise argparse.ArgumentTypeError(f"{error}; seeds are 3, 0,1,2 or 0:4 (0 to 3)") from None
     if not seeds:
         raise argparse.ArgumentTypeError(f"{text!r} holds no seed")
-    return seeds
+    if len(seeds) > MOST_SEEDS:
+        raise argparse.ArgumentTypeError(f"{text!r} are more than {MOST_SEEDS:,} seeds")
+    return list(seeds)

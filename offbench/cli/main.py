@@ -135,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     143 after SIGTERM.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions
+    if {"_ARGCOMPLETE", "COMP_LINE", "COMP_POINT"} <= os.environ.keys():  # a shell asks for completions
         _complete()
     _open_closed()
     os.environ["MPLBACKEND"] = "Agg"  # figures are files; matplotlib does not import with a name that it does not have
@@ -233,7 +233,8 @@ def _open_closed() -> None:
             else:
                 os.dup2(null, number)
                 os.close(null)
-            setattr(sys, name, os.fdopen(number, "r" if name == "stdin" else "w", encoding="utf-8", closefd=False))
+            mode = "r" if name == "stdin" else "w"
+            setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", errors="backslashreplace", closefd=False))
 
 
 def _drop_unwritten() -> None:

@@ -207,9 +207,23 @@ def delete(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def home_folder(variable: str) -> Path:
+    """Return the user's home. Raises OffbenchError if there is none: `variable` names a folder to use instead."""
+    try:
+        return Path.home()
+    except RuntimeError:
+        raise OffbenchError(f"there is no home folder; set HOME or {variable}") from None
+
+
 def output_file(path: str | Path) -> Path:
-    """Return the path of a file to write. Raises OffbenchError if its folder does not exist."""
+    """Return the path of a file to write.
+
+    Raises:
+        OffbenchError: its folder does not exist, or something other than a file is there.
+    """
     path = Path(path)
+    if not path.name or (path.exists() and not path.is_file()):
+        raise OffbenchError(f"cannot write {path}: it is not a file; choose another name")
     if not path.parent.is_dir():
         raise OffbenchError(f"cannot write {path}: there is no folder {path.parent}")
     return path
@@ -292,7 +306,12 @@ def regular(path: str | Path, flags: int = os.O_RDONLY) -> int:
     Raises:
         OSError: it is not a regular file, or cannot be opened.
     """
-    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    try:
+        descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    except OSError as error:
+        if error.errno == errno.ENXIO:  # a socket, or a device of nothing
+            raise OSError(f"{path} is not a regular file") from None
+        raise
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError(f"{path} is not a regular file")

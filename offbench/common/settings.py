@@ -102,7 +102,7 @@ def read_back(cls: type[T], values: object, file: Path | str, remedy: str) -> T:
 
 def _from_json(cls: type[T], values: object) -> T:
     if not isinstance(values, dict):
-        raise ValueError(f"must be a JSON object, not {_shown(values)}")
+        raise ValueError(f"must be a JSON object, not {shown(values)}")
     return cls(**_checked(cls, {key: values[key] for key in fields(cls) if key in values}, "", parse=False))
 
 
@@ -129,7 +129,7 @@ def check(cls: type, name: str, value: object, where: str, *, parse: bool = True
     try:
         value = _convert(value, hint, parse)
     except (TypeError, ValueError, OverflowError):
-        raise _error(where, f"{name} must be {_describe(hint)}, not {_shown(value)}") from None
+        raise _error(where, f"{name} must be {_describe(hint)}, not {shown(value)}") from None
     metadata = fields(cls)[name].metadata
     numbers = value if isinstance(value, tuple) else (value,)
     for number in numbers:
@@ -137,7 +137,7 @@ def check(cls: type, name: str, value: object, where: str, *, parse: bool = True
     return value
 
 
-def _shown(value: object) -> str:
+def shown(value: object) -> str:
     """Return any value of a file as short text for an error line."""
     try:
         return f"{value!r:.60}"

@@ -6,6 +6,7 @@ import re
 from collections.abc import Collection, Sequence
 
 LARGEST = 2**63 - 1  # whole number that files hold
+MOST_SEEDS = 100_000  # of one command: a larger count is a typing error, and would fill the memory
 
 
 def whole_number(text: str) -> int:

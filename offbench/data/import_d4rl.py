@@ -34,7 +34,7 @@ from offbench.common.terminal import inform, warn
 from offbench.data import minari_store, minari_writer
 from offbench.data.d4rl_file import NUMBERS, SEEDS, Source, read_source
 from offbench.data.minari_reader import flags
-from offbench.envs.environments import Space, box, make_env, parse_spec, spaces_of, time_limit
+from offbench.envs.environments import Space, box, make_env, parse_spec, spaces_of, time_limit, untrusted_env
 from offbench.envs.margin_rule import ADDED, MARGIN, without_margin
 from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference, load_recipe, names
 from offbench.rollouts.rollouts import Episode
@@ -241,7 +241,7 @@ def _starts(source: Source, origin: _Origin) -> Array:
             "before the time limit of the last one cannot be detected: each leaves one false transition"
         )
         return starts
-    env = make_env(origin.evaluated)
+    env = make_env(origin.evaluated) if origin.recipe else untrusted_env(origin.evaluated, str(source.path))
     first_ones = np.array([env.reset(seed=seed)[0] for seed in range(RESETS)], np.float64)
     env.close()
     middle, spread = (first_ones.max(0) + first_ones.min(0)) / 2, (first_ones.max(0) - first_ones.min(0)) / 2

@@ -21,6 +21,7 @@ from offbench.common.files import (
     delete,
     disk_errors,
     exclusive_lock,
+    home_folder,
     read_json,
 )
 from offbench.common.scores import are_references
@@ -71,7 +72,7 @@ KEY = "offbench"  # under which all that Minari has no field for is kept in the 
 def root() -> Path:
     """Return Minari's folder: $MINARI_DATASETS_PATH, else ~/.minari/datasets."""
     path = os.environ.get("MINARI_DATASETS_PATH")
-    return Path(path) if path else Path.home() / ".minari" / "datasets"
+    return Path(path) if path else home_folder("MINARI_DATASETS_PATH") / ".minari" / "datasets"
 
 
 def check_id(dataset_id: str) -> str:
@@ -96,8 +97,12 @@ def local_ids(unreadable: Callable[[OSError], None] | None = None) -> list[str]:
     Args:
         unreadable: is called with the error of each folder that cannot be read.
     """
-    base, ids = root(), []
+    base, ids, seen = root(), list[str](), set[str]()
     for folder, folders, _ in os.walk(base, onerror=unreadable, followlinks=True):
+        if (real := os.path.realpath(folder)) in seen:  # links can make a circle
+            folders.clear()
+            continue
+        seen.add(real)
         if os.path.isfile(os.path.join(folder, "data", "metadata.json")):
             ids.append(os.path.relpath(folder, base))
             folders.clear()

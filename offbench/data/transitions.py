@@ -31,6 +31,7 @@ from offbench.common.files import (
     damage,
     delete,
     disk_errors,
+    home_folder,
     read_json,
     read_text,
     remove_leftovers,
@@ -192,7 +193,7 @@ def cache() -> Path:
     if path:
         return Path(path)
     base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "offbench"
+    return (Path(base) if base else home_folder("OFFBENCH_CACHE") / ".cache") / "offbench"
 
 
 def _key(dataset_id: str, content: str | None, stamps: Stamps) -> str:

@@ -20,7 +20,7 @@ from typing import TypeVar
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import damage, read_text
 from offbench.common.scores import are_references
-from offbench.common.settings import build, setting
+from offbench.common.settings import build, setting, shown
 from offbench.envs.environments import env_spec
 from offbench.envs.margin_rule import ADDED, EARLIER, with_margin
 
@@ -142,7 +142,7 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
 
 def _table(value: object, key: str, where: str) -> dict[str, object]:
     if not isinstance(value, dict):
-        raise OffbenchError(f"{where}: {key} must be a table, not {value!r}")
+        raise OffbenchError(f"{where}: {key} must be a table, not {shown(value)}")
     return value
 
 
@@ -150,7 +150,7 @@ def _kwargs(value: object, where: str) -> tuple[tuple[str, object], ...]:
     table = _table(value, "env_kwargs", where)
     try:
         json.dumps(table)
-    except (TypeError, ValueError):  # a date, a number of 5000 digits
+    except (TypeError, ValueError, RecursionError):  # a date, a number of 5000 digits
         words = "numbers, text, true, false, lists and tables"
         raise OffbenchError(f"{where}: env_kwargs may hold {words} only") from None
     return tuple(sorted(table.items()))

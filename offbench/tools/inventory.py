@@ -84,6 +84,8 @@ def _runs(root: str | Path) -> list[JsonObject]:
     from offbench.analysis.results import entries_of
     from offbench.training.run import find_runs
 
+    if Path(root).exists() and not Path(root).is_dir():
+        raise OffbenchError(f"{root} is not a folder of runs")
     entries, waiting = entries_of(find_runs(Path(root)))
     rows = [
         _run(entry.task.name, entry.method.label, trained.run, trained.config, trained)

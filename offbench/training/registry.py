@@ -188,9 +188,9 @@ def _from_file(reference: str) -> type[Algorithm]:
     from offbench.algorithm.interface import Algorithm
 
     text, _, name = reference.rpartition(":") if reference.rpartition(":")[0].endswith(".py") else (reference, "", "")
-    path = Path(text).expanduser().resolve()
-    if not path.is_file():
+    if not os.path.isfile(os.path.expanduser(text)):  # unlike Path's, False for a name that no file can have
         raise OffbenchError(f"no algorithm file {text}")
+    path = Path(os.path.expanduser(text)).resolve()
     if not path.stem.isidentifier():
         raise OffbenchError(f"{text}: rename the file to what Python can import, such as my_algorithm.py")
     if str(path.parent) not in sys.path:
