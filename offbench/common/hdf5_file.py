@@ -85,10 +85,24 @@ class SafeFile:
             os.fsync(self._file.fileno())
 
 
+CALLBACKS = {
+    function.__code__
+    for function in (
+        SafeFile.write,
+        SafeFile.readinto,
+        SafeFile.read,
+        SafeFile.seek,
+        SafeFile.tell,
+        SafeFile.truncate,
+        SafeFile.flush,
+    )
+}
+
+
 @contextlib.contextmanager
 def safe_file(path: Path) -> Iterator[SafeFile]:
     """Open a new file for libhdf5. Raises OSError at the end if a write failed."""
-    with stops_noted() as stops:
+    with stops_noted(within=CALLBACKS) as stops:
         file = SafeFile(path, stops)
         try:
             yield file

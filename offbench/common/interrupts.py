@@ -10,8 +10,9 @@ import os
 import signal
 import sys
 import threading
+import traceback
 import types
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 STOPS = {signal.SIGINT, signal.SIGTERM}
 
@@ -34,15 +35,21 @@ def stops_delayed() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stops_noted(second_at_once: bool = False) -> Iterator[list[int]]:
+def stops_noted(second_at_once: bool = False, within: Collection[types.CodeType] | None = None) -> Iterator[list[int]]:
     """Collect Ctrl-C and SIGTERM in the list that this yields, and raise the first again at the end.
 
     Args:
         second_at_once: let a second Ctrl-C raise KeyboardInterrupt without waiting for the end.
+        within: collect only what arrives while one of these functions runs.
     """
     received: list[int] = []
 
     def note(number: int, frame: types.FrameType | None) -> None:
+        if within is not None and not any(caller.f_code in within for caller, _ in traceback.walk_stack(frame)):
+            signal.signal(number, handlers[signal.Signals(number)])
+            signal.raise_signal(number)
+            signal.signal(number, note)  # it did not raise
+            return
         received.append(number)
         if second_at_once and number == signal.SIGINT:
             if received.count(number) > 1:
@@ -52,7 +59,9 @@ def stops_noted(second_at_once: bool = False) -> Iterator[list[int]]:
     # only the main thread may set handlers; None is a handler that Python cannot restore
     stops = STOPS if threading.current_thread() is threading.main_thread() else ()
     handled = [stop for stop in stops if signal.getsignal(stop) not in (None, signal.SIG_IGN)]
-    handlers = {stop: signal.signal(stop, note) for stop in handled}
+    handlers = {stop: signal.getsignal(stop) for stop in handled}  # before `note` is called
+    for stop in handled:
+        signal.signal(stop, note)
     try:
         yield received
     finally:

@@ -188,7 +188,7 @@ class Run:
     def check_claimed(self, config: RunConfig) -> None:
         """Check, with the lock held, that this is the run of `config`. Raises OffbenchError if it is not."""
         if reason := self._refusal(config):
-            raise OffbenchError(f"{reason}; it was changed since the training was started: run the command again")
+            raise OffbenchError(f"{reason}; run the command again")
 
     def claim(self, config: RunConfig) -> None:
         """Write config.json, unless this very run is there.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import warnings
 from pathlib import Path
 from typing import Any
@@ -291,7 +292,7 @@ def test_a_file_where_a_folder_should_be(
 def test_a_full_disk_is_seen_before_recording(
     tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(minari_store.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10_000})())
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10_000})())
     recipe, behaviour_dir = tiny
     line = refusal(["collect", recipe, "--behaviour-dir", behaviour_dir], capsys)
     assert "not enough room" in line

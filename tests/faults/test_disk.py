@@ -42,7 +42,7 @@ def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]
 @pytest.fixture
 def no_look_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let recording begin although it will not fit, as when another program fills the disk meanwhile."""
-    monkeypatch.setattr(minari_store.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10**12})())
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10**12})())
 
 
 def state(folder: Path) -> dict[str, bytes]:

@@ -16,6 +16,7 @@ import pytest
 
 import offbench
 from offbench.cli.main import Terminated, _terminable, main
+from offbench.common import hdf5_file
 from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import exclusive_lock, write_bytes
 from offbench.common.hdf5_file import SafeFile
@@ -165,7 +166,8 @@ def test_a_stop_within_a_write_of_hdf5_is_a_stop(
         "export --format npz": ["export", medium, "--out", "out.npz"],
     }[command]
     before = {path for path in home.rglob("*") if path.suffix not in (".lock", ".tmp")}
-    once(monkeypatch, SafeFile, "write", lambda: signal.raise_signal(number), call)
+    monkeypatch.setattr(hdf5_file, "memoryview", memoryview, raising=False)  # which `write` and `readinto` call
+    once(monkeypatch, hdf5_file, "memoryview", lambda: signal.raise_signal(number), call)
     with pytest.raises(SystemExit) as stopped:
         main(words)
     assert stopped.value.code == {signal.SIGINT: 130, signal.SIGTERM: 143}[signal.Signals(number)]
@@ -175,6 +177,15 @@ def test_a_stop_within_a_write_of_hdf5_is_a_stop(
     assert "bug" not in said
     after = {path for path in home.rglob("*") if path.suffix not in (".lock", ".tmp") and path.is_file()}
     assert after <= before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_between_writes_of_hdf5_is_not_delayed(number: int, tmp_path: Path, ctrl_c: None) -> None:
+    """The next episode may take long, or never come."""
+    with _terminable(), hdf5_file.safe_file(tmp_path / "x") as file:
+        file.write(b"1")
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
 
 
 def test_a_stop_within_a_finalizer_is_not_lost() -> None:
