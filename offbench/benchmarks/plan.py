@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from offbench.common.text import counted
 from offbench.data import minari_store
 from offbench.data.levels import full_size, parse_level
 from offbench.data.recorded_env import evaluation_spec
-from offbench.envs.environments import make_env, spaces_of, untrusted_env
+from offbench.envs.environments import make_env, parse_spec, spaces_of, time_limit, untrusted_env
 from offbench.envs.recipes import load_recipe
 from offbench.training.devices import Machine, pick_machine
 from offbench.training.run import Run
@@ -175,7 +174,7 @@ class Plan:
 
 def _cost(spec: RunSpec, rate: Rate, play: float, env_spec: str) -> float:
     """Return the seconds of one run: its updates and its evaluations, full-length episodes assumed."""
-    length = json.loads(env_spec).get("max_episode_steps") or 1000
+    length = time_limit(parse_spec(env_spec)) or 1000
     episodes = -(-spec.steps // spec.eval_every) * spec.eval_episodes
     return spec.steps / rate.updates + episodes * length * play
 

@@ -14,6 +14,7 @@ from offbench.algorithm.interface import Algorithm
 from offbench.algorithm.mlp import products_by
 from offbench.data.transitions import Transitions
 from offbench.envs.environments import make_env, spaces_of
+from offbench.rollouts.rollouts import reset, step
 from offbench.training.captured_update import RECORDED
 from offbench.training.devices import arithmetic
 from offbench.training.grouping import stack_size
@@ -118,14 +119,14 @@ def random_data(env_spec: str, rows: int = ROWS) -> Transitions:
 def step_seconds(spec: str) -> float:
     """Return the seconds of one step of an environment under uniform actions."""
     env = make_env(spec)
-    env.reset(seed=0)
+    reset(env, 0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(ENV_STEPS)]
     began = time.perf_counter()
     for action in actions:
-        _, _, terminated, truncated, _ = env.step(action)
+        _, _, terminated, truncated = step(env, action)
         if terminated or truncated:
-            env.reset()
+            reset(env, None)
     spent = time.perf_counter() - began
     env.close()
     return spent / ENV_STEPS

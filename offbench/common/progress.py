@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from offbench.common.terminal import console, is_terminal
+from offbench.common.text import printable
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -27,6 +28,7 @@ class Progress:
     """
 
     def __init__(self, total: int, what: str, start: int = 0, work: float | None = None) -> None:
+        what = printable(what)
         self.total, self.what, self.done = total, what, start
         self._work: float = total if work is None else work
         self._worked: float = start

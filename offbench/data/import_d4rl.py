@@ -324,6 +324,7 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
         metadata["eval_env_spec"], rule = without_margin(origin.evaluated)
         if origin.recipe and rule == ADDED:
             ours[MARGIN] = rule
+    minari_store.check_metadata(metadata, f"{source.path}: its offbench attribute", "export the dataset again")
     return metadata, _spaces(source, origin.recipe)
 
 

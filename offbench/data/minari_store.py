@@ -162,21 +162,27 @@ def read_metadata(dataset_id: str) -> JsonObject:
         raise _absent(dataset_id)
     remedy = "record or download the dataset again"
     metadata = read_json(path, remedy)
-    try:
-        _check_metadata(metadata)
-    except (ValueError, TypeError, RecursionError) as error:
-        raise DamagedError(f"{path} is damaged: {error}; {remedy}") from None
-    if metadata.get(KEY) is not None:
-        read_back(Provenance, metadata[KEY], path, remedy)
+    check_metadata(metadata, path, remedy)
     return metadata
+
+
+def check_metadata(metadata: JsonObject, where: str | Path, remedy: str) -> None:
+    """Raise DamagedError if a field that offbench reads is of another kind than it should be; all may be missing."""
+    try:
+        _check_fields(metadata)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise DamagedError(f"{where} is damaged: {error}; {remedy}") from None
+    if metadata.get(KEY) is not None:
+        read_back(Provenance, metadata[KEY], where, remedy)
 
 
 TEXTS = ("env_spec", "eval_env_spec", "observation_space", "action_space", "algorithm_name", "description")
 NUMBERS = ("ref_min_score", "ref_max_score", "total_steps", "total_episodes")
 
 
-def _check_metadata(metadata: JsonObject) -> None:
-    """Raise ValueError if a field that is read here is of another kind than it should be; all may be missing."""
+def _check_fields(metadata: JsonObject) -> None:
+    """Raise ValueError if one of Minari's fields is of another kind than it should be, or text cannot be written."""
+    json.dumps(metadata, ensure_ascii=False, default=list).encode()
     for key in (*TEXTS, *NUMBERS):
         value = metadata.get(key)
         number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e15

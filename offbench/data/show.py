@@ -12,6 +12,7 @@ from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
 from offbench.common.scores import normalize
+from offbench.common.settings import shown
 from offbench.data import minari_store, transitions
 
 BINS = 12
@@ -89,7 +90,7 @@ def fact(value: object) -> str:
     if isinstance(value, bool) or not isinstance(value, int | float | list):
         return str(value)
     if isinstance(value, list):
-        return " to ".join(map(fact, value))
+        return " to ".join(shown(item) if isinstance(item, list) else fact(item) for item in value)
     return f"{value:,}" if isinstance(value, int) else f"{value:,.4g}" if abs(value) < 100 else f"{value:,.1f}"
 
 

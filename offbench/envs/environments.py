@@ -124,7 +124,11 @@ def untrusted_env(text: str, where: str) -> Env:
                     "arguments"
                 )
         check_code(spec)
-        return make_env(text)
+        env = make_env(text)
+        for space in ("observation_space", "action_space"):
+            if not isinstance(getattr(env, space, None), gym.Space):
+                raise OffbenchError(f"its environment {spec.id} has no {space}")
+        return env
     except OffbenchError as error:
         raise OffbenchError(f"{where}: {error}") from None
     except Exception as error:  # see env_spec
@@ -171,8 +175,7 @@ def make_env(spec: str, render_mode: str | None = None) -> Env:
     plain, rule = without_margin(spec)
     made = EnvSpec.from_json(plain)
     made.disable_env_checker = True
-    if made.kwargs.get("render_mode") == "human":  # of whoever recorded the data; it would open a window
-        del made.kwargs["render_mode"]
+    made.kwargs.pop("render_mode", None)  # of whoever recorded the data; it could open a window
     with _quiet_loading(made.id):
         env: Env = gym.make(made, render_mode=render_mode) if render_mode else gym.make(made)  # with the EnvSpec's own
     if hasattr(env.unwrapped, "model"):
@@ -287,12 +290,15 @@ def box(space: Space, what: str) -> gym.spaces.Box:
     return space
 
 
+LARGEST_FLAT = 1_000_000  # dimensions
+
+
 def _flattening(space: Space, what: str) -> str:
     """Return how to turn a space of observations into a flat Box of floats; actions cannot be turned into one."""
     if "observation" not in what:
         return "offbench's algorithms choose continuous actions, one number for each dimension"
     try:
-        flat: Space = gym.spaces.flatten_space(space)
+        flat: Space = gym.spaces.flatten_space(space) if gym.spaces.flatdim(space) < LARGEST_FLAT else space
     except (NotImplementedError, ValueError):
         flat = space
     if not isinstance(flat, gym.spaces.Box):

@@ -10,6 +10,7 @@ import contextlib
 import importlib
 import importlib.metadata
 import importlib.util
+import math
 import os
 import re
 import sys
@@ -20,6 +21,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import environment
+from offbench.common.settings import shown
 
 VARIABLE = "OFFBENCH_TRUST"
 REMEDY = f"if you trust where it is from, add --trust ({VARIABLE}=1 in Python)"
@@ -51,6 +53,7 @@ WRAPPERS = {
 }
 ENTRY_POINT = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)", re.ASCII)
 LARGEST = 10_000  # whole number among arguments: frame_skip = 2e9 would never return
+REPEATING = ("frame_skip", "num_repeats", "skip", "stack_size", "delay")  # arguments whose effects multiply
 MOST = 10_000  # values in all arguments together
 DEEPEST = 10
 LONGEST = 200  # characters of a text
@@ -80,11 +83,17 @@ def check_code(spec: EnvSpec) -> None:
     for wrapper in spec.additional_wrappers:
         _check_class(wrapper.entry_point, gym.Wrapper)
     if not is_trusting():
-        if not isinstance(spec.max_episode_steps, int | None):
-            raise OffbenchError(f"its time limit is {spec.max_episode_steps!r}, not a number of steps")
-        plain = _Plain()
+        limit = spec.max_episode_steps
+        if limit is not None and (type(limit) is not int or not (limit > 0 or limit == -1)):  # -1: no limit
+            raise OffbenchError(f"its time limit is {shown(limit)}, not a number of steps")
+        plain, times = _Plain(), 1
         for name, kwargs in ((spec.id, spec.kwargs), *((w.name, w.kwargs or {}) for w in spec.additional_wrappers)):
             plain.check(kwargs, f"the arguments of {name}")
+            times *= math.prod(max(1, kwargs[key]) for key in REPEATING if isinstance(kwargs.get(key), int))
+        if times > LARGEST:
+            raise OffbenchError(
+                f"its wrappers together repeat or stack {times:,} steps, {LARGEST:,} at most; {REMEDY}"
+            )
 
 
 def _check_class(entry_point: object, base: type) -> None:
@@ -99,7 +108,7 @@ def _check_class(entry_point: object, base: type) -> None:
     if not is_trusting():
         _check_installed(names[1])
     cls = getattr(importlib.import_module(names[1]), names[2], None)
-    if not (isinstance(cls, type) and issubclass(cls, base)):
+    if not (isinstance(cls, type) and issubclass(cls, base) and cls is not base):
         raise OffbenchError(
             f"its entry point {entry_point!r} is not a class derived from {base.__name__}, so it is not run"
         )

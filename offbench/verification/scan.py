@@ -40,10 +40,10 @@ class Survey:
         return sum(self.lengths)
 
 
-def scan(data: MinariDataset, limit: int | None, findings: Findings) -> Survey:
+def scan(dataset_id: str, data: MinariDataset, limit: int | None, findings: Findings) -> Survey:
     """Look at every episode of a MinariDataset once; `limit` is the environment's time limit, if it has one."""
     result, piles, twins = Survey(), _Piles(data.action_space), _Twins()
-    with Progress(int(data.total_steps), f"verifying {data.storage.metadata.get('dataset_id')}") as progress:
+    with Progress(int(data.total_steps), f"verifying {dataset_id}") as progress:
         for episode in episodes_of(data):
             where = f"episode {episode.index}"
             numeric = all(array.dtype.kind in "fiub" for array in episode.arrays)

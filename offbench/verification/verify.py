@@ -74,7 +74,7 @@ def _verify(dataset_id: str, episodes: int | None, workers: int | None) -> Repor
         box(data.action_space, f"{dataset_id}: actions")
         limit = _limit(metadata.get("env_spec"))
         with reading(dataset_id):
-            survey = scan(data, limit, findings)
+            survey = scan(dataset_id, data, limit, findings)
     except DamagedError as error:
         text = str(error)
         findings.add(code, dataset_id, text.rpartition("; ")[0] or text)  # the finding has a remedy of its own

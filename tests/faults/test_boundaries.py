@@ -13,6 +13,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.common.files import home_folder, output_file, regular
 from offbench.data import minari_store
+from offbench.envs.environments import box, make_env, untrusted_env
 from tests.faults.test_integrity import refusal
 
 
@@ -80,6 +82,7 @@ def test_a_damaged_sb3_zip_is_one_line(method: int, tmp_path: Path) -> None:
             read_sb3_zip(path, -np.ones(3, np.float32), np.ones(3, np.float32), "X-v0")
 
 
+ABSTRACT = {"model_path": "inverted_pendulum.xml", "frame_skip": 2, "observation_space": None}
 HUGE = "0x" + "F" * 5000  # TOML has no limit for it, Python prints no number of 5,000 digits
 DEEP = ".a" * 1000
 
@@ -173,3 +176,93 @@ def test_ctrl_c_while_the_program_starts(home: Path) -> None:
 def test_a_completion_without_its_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("_ARGCOMPLETE", "1")
     main(["list", "datasets"])
+
+
+def spec_of(**changes: Any) -> str:
+    return json.dumps(json.loads(gym.spec("InvertedPendulum-v5").to_json()) | changes)
+
+
+def wrapped(name: str, times: int, **kwargs: Any) -> list[dict[str, Any]]:
+    entry_point = f"gymnasium.wrappers.{kwargs.pop('module', 'common')}:{name}"
+    return [{"name": name, "entry_point": entry_point, "kwargs": kwargs}] * times
+
+
+@pytest.mark.parametrize("mode", ["human", "human_list", "rgb_array_list", "rgb_array", "nonsense", 3])
+def test_no_render_mode_of_a_file_is_used(mode: object) -> None:
+    env = make_env(spec_of(kwargs={"render_mode": mode}))
+    env.reset(seed=0)
+    assert env.render_mode is None
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"additional_wrappers": wrapped("RepeatAction", 3, module="stateful_action", num_repeats=100)}, "1,000,000"),
+        (
+            {"kwargs": {"frame_skip": 200}, "additional_wrappers": wrapped("MaxAndSkipObservation", 1, skip=60)},
+            "12,000",
+        ),
+        ({"additional_wrappers": wrapped("FrameStackObservation", 2, stack_size=300)}, "90,000"),
+        ({"kwargs": {"reset_noise_scale": float("inf")}}, "hold inf"),
+        ({"entry_point": "gymnasium.envs.registration:Env"}, "not a class derived from"),
+        ({"entry_point": "gymnasium:Env"}, "not among the environments"),
+        ({"max_episode_steps": True}, "its time limit is True"),
+        ({"max_episode_steps": 0}, "its time limit is 0"),
+        (
+            {"entry_point": "gymnasium.envs.mujoco.mujoco_env:MujocoEnv", "kwargs": ABSTRACT},
+            "has no observation_space",
+        ),
+    ],
+)
+def test_an_environment_of_a_file_that_is_none_or_never_ends(changes: dict[str, Any], fault: str) -> None:
+    with pytest.raises(OffbenchError, match=fault):
+        untrusted_env(spec_of(**changes), "file")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"ref_min_score": 1e300},
+        {"ref_max_score": True},
+        {"description": "\ud800"},
+        {"offbench": {"level": 5}},
+        {"offbench": {"seed": "x"}},
+        {"offbench": {"parts": 5}},
+    ],
+)
+def test_damaged_metadata_of_a_d4rl_file_replace_no_dataset(change: dict[str, Any], medium: str) -> None:
+    offbench.export(medium, "in.hdf5")
+    with h5py.File("in.hdf5", "a") as file:
+        about = json.loads(file.attrs["offbench"])
+        about |= {key: about[key] | value if isinstance(value, dict) else value for key, value in change.items()}
+        file.attrs["offbench"] = json.dumps(about)
+    before = minari_store.read_metadata(medium)
+    with pytest.raises(OffbenchError, match=r"in\.hdf5.*damaged"):
+        offbench.import_d4rl("in.hdf5", medium, overwrite=True)
+    assert minari_store.read_metadata(medium) == before
+
+
+def test_odd_metadata_of_a_dataset_are_no_bug(medium: str, capsys: pytest.CaptureFixture[str]) -> None:
+    path = minari_store.path_of(medium) / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    metadata["dataset_id"] = "\x1b[31mother"
+    metadata["requirements"] = [f"mujoco>={'9' * 5000}"]
+    nested: Any = "uniform"
+    for _ in range(600):
+        nested = [nested]
+    metadata["offbench"]["parts"][0]["source"] = nested
+    path.write_text(json.dumps(metadata))
+    main(["show", medium])
+    with pytest.raises(SystemExit) as stopped:
+        main(["verify", medium])
+    assert stopped.value.code == 1
+    said = capsys.readouterr()
+    assert "bug" not in said.err
+    assert "\x1b" not in said.err + said.out
+    assert f"verifying {medium}" in said.err
+
+
+def test_a_huge_space_is_refused_at_once() -> None:
+    with pytest.raises(OffbenchError, match="must be a"):
+        box(gym.spaces.Discrete(10**12), "observations")
