@@ -91,9 +91,7 @@ def check_code(spec: EnvSpec) -> None:
             plain.check(kwargs, f"the arguments of {name}")
             times *= math.prod(max(1, kwargs[key]) for key in REPEATING if isinstance(kwargs.get(key), int))
         if times > LARGEST:
-            raise OffbenchError(
-                f"its wrappers together repeat or stack {times:,} steps, {LARGEST:,} at most; {REMEDY}"
-            )
+            raise OffbenchError(f"it would repeat or stack {times:,} steps, and {LARGEST:,} are allowed; {REMEDY}")
 
 
 def _check_class(entry_point: object, base: type) -> None:
