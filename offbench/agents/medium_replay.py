@@ -12,13 +12,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import gymnasium as gym
 import h5py
 import numpy as np
-import numpy.typing as npt
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import read_bytes, sha256, write_bytes
+from offbench.common.files import damage, read_bytes, sha256, write_bytes
+from offbench.common.hdf5_file import MOST_COMPRESSED, stored_elsewhere
 from offbench.rollouts.rollouts import Episode
 
 if TYPE_CHECKING:
@@ -85,11 +86,13 @@ def save_replay(path: Path, pieces: Iterator[Piece]) -> dict[str, int | str]:
     return {"transitions": len(arrays["rewards"]), "episodes": len(whole), "sha256": sha256(data.getvalue())}
 
 
-def load_replay(path: Path, expected_sha256: str, low: Array, high: Array, dtype: npt.DTypeLike) -> Iterator[Episode]:
+def load_replay(
+    path: Path, expected_sha256: str, observations: gym.spaces.Box, low: Array, high: Array
+) -> Iterator[Episode]:
     """Yield the recorded episodes, actions in the environment's bounds, observations in its precision.
 
     Raises:
-        OffbenchError: the file is missing or is not the one its ladder describes.
+        OffbenchError: the file is missing, damaged, or not the one its ladder describes.
     """
     try:
         data = read_bytes(path)
@@ -101,18 +104,43 @@ def load_replay(path: Path, expected_sha256: str, low: Array, high: Array, dtype
         raise OffbenchError(
             f"{path} is damaged (its SHA-256 differs from the ladder's); reinstall, or build the ladder again"
         )
-    with h5py.File(io.BytesIO(data), "r") as file:
-        arrays = {name: values[()] for name, values in file.items()}
+    with damage(str(path), "is damaged", "build the ladder again with `offbench behaviour`"):
+        arrays = _arrays(data, observations.shape[0], len(low))
     span = (high.astype(np.float64) - low) / 2
     row = step = 0
     for length, terminated in zip(arrays["lengths"], arrays["terminated"], strict=True):
         actions = np.clip(low + (arrays["actions"][step : step + length] + 1.0) * span, low, high)
         yield Episode(
             NO_SEED,
-            arrays["observations"][row : row + length + 1].astype(dtype),
+            arrays["observations"][row : row + length + 1].astype(observations.dtype),
             actions.astype(np.float32),
             arrays["rewards"][step : step + length].astype(np.float64),
             bool(terminated),
             not terminated,
         )
         row, step = row + length + 1, step + length
+
+
+def _arrays(data: bytes, obs: int, act: int) -> dict[str, Array]:
+    """Return the arrays of a replay file. Raises ValueError if they do not fit together or hold NaN."""
+    with h5py.File(io.BytesIO(data), "r") as file:
+        if elsewhere := stored_elsewhere(file):
+            raise ValueError(f"{elsewhere} is not data of this file")
+        columns = {name: file[name] for name in ("observations", "actions", "rewards", "lengths", "terminated")}
+        for name, column in columns.items():
+            kinds = {"lengths": "iu", "terminated": "biu"}.get(name, "f")
+            if column.dtype.kind not in kinds or column.nbytes > MOST_COMPRESSED * len(data):
+                raise ValueError(f"{name} are {column.dtype} {column.shape}")
+        arrays: dict[str, Array] = {name: column[()] for name, column in columns.items()}
+    steps, episodes = len(arrays["rewards"]), len(arrays["lengths"])
+    shapes = {"observations": (steps + episodes, obs), "actions": (steps, act), "rewards": (steps,)}
+    shapes |= dict.fromkeys(("lengths", "terminated"), (episodes,))
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"{name} have shape {arrays[name].shape}, not {shape}")
+        if not np.isfinite(arrays[name]).all():
+            raise ValueError(f"{name} hold NaN or infinite numbers")
+    lengths = arrays["lengths"]
+    if not ((lengths >= 1) & (lengths <= steps)).all() or lengths.sum() != steps:
+        raise ValueError(f"the lengths of its episodes do not add up to {steps}")
+    return arrays

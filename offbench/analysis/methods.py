@@ -150,7 +150,8 @@ def find_method(methods: Sequence[Method], name: str) -> Method:
 def _beta(value: object) -> str | None:
     if isinstance(value, int | float) and abs(value) < 1e6:
         return text if float(text := f"{value:.2f}") == value else f"{value:g}"
-    return None if value is None else str(value)  # what a damaged config.json or another's algorithm has there
+    # what a damaged config.json or another's algorithm has there
+    return None if value is None else f"{' '.join(str(value).split()):.60}"
 
 
 def rank(name: str, order: Sequence[str]) -> tuple[int, str]:

@@ -55,6 +55,7 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], J
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             if not isinstance(state, dict) or state.get("step") != step:
                 raise ValueError(f"it does not hold step {step}")
+            _check_state(state)
             recorded = state.pop("sha256", None)  # older files have none
             if recorded is not None and recorded != _sha256(tensors, state):
                 raise ValueError("its SHA-256 does not match its content")
@@ -62,6 +63,15 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], J
     except (DamagedError, FileNotFoundError) as error:
         inform(str(error))
         return None
+
+
+def _check_state(state: JsonObject) -> None:
+    """Raise ValueError if a part of a run's state has another type than it is written with."""
+    if not isinstance(state.get("origin", {}), dict):
+        raise ValueError("its origin is not an object")
+    for name, total, count in state.get("unlogged", []):
+        if not isinstance(name, str) or type(total) not in (int, float) or type(count) is not int or count < 1:
+            raise ValueError("its unlogged sums are not numbers")
 
 
 def _sha256(tensors: dict[str, torch.Tensor], state: JsonObject) -> str:

@@ -10,7 +10,11 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import h5py
+
 from offbench.common.interrupts import stops_noted
+
+MOST_COMPRESSED = 1000  # largest ratio of an array's size to the file's: more is a damaged or malicious file
 
 
 class SafeFile:
@@ -111,3 +115,20 @@ def safe_file(path: Path) -> Iterator[SafeFile]:
                 file.close()
             raise
         file.close()
+
+
+def stored_elsewhere(file: h5py.File) -> str | None:
+    """Return the name of something below the root that is a link, or stored in another file."""
+    groups, seen = [file["/"]], set()
+    while groups:
+        group = groups.pop()
+        for name in group:
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                return f"{group.name}/{name}".replace("//", "/")
+            member = group[name]
+            if isinstance(member, h5py.Dataset) and (member.external or member.is_virtual):
+                return str(member.name)
+            if isinstance(member, h5py.Group) and member.id not in seen:  # hard links can make a circle
+                seen.add(member.id)
+                groups.append(member)
+    return None

@@ -260,8 +260,8 @@ class _Recording:
     def episodes(self, part: Part, rung: Rung | None, count: int, index: int) -> Iterator[Episode]:
         """Yield a part's episodes, exactly `count` transitions: the last one is cut."""
         if part.source == "replay":
-            expected, dtype = self.ladder.info.medium_replay.sha256, self.observation_space.dtype
-            yield from cut_at(load_replay(self.ladder.replay, expected, *self.bounds, dtype), count)
+            expected = self.ladder.info.medium_replay.sha256
+            yield from cut_at(load_replay(self.ladder.replay, expected, self.observation_space, *self.bounds), count)
             return
         with (
             Rollouts(self.spec, self.workers) as rollouts,

@@ -13,13 +13,13 @@ from minari.serialization import deserialize_space
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
+from offbench.common.hdf5_file import MOST_COMPRESSED
 from offbench.data import minari_store
 from offbench.envs.environments import parse_spec
 
 COLUMNS = ("observations", "actions", "rewards", "terminals")
 SEEDS = ("infos/seed", "infos/seeded")  # seeded: where some episodes have a seed of 2**63 or more, and some none
 OPTIONAL = ("timeouts", "next_observations", *SEEDS)
-MOST_COMPRESSED = 1000  # largest ratio of a column's size to the file's: more is a damaged or malicious file
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from gymnasium.spaces import Box
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import damage, regular
+from offbench.common.hdf5_file import stored_elsewhere
 from offbench.data import minari_store
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ def check_storage(dataset_id: str) -> None:
         if path.suffix != ".hdf5":
             continue
         with reading(dataset_id), h5py.File(path) as file:
-            elsewhere = _elsewhere(file)
+            elsewhere = stored_elsewhere(file)
         if elsewhere:
             raise DamagedError(f"{dataset_id} is not read: {elsewhere} is not data of {path}; get it from its source")
 
@@ -118,23 +119,6 @@ def _files(dataset_id: str) -> list[Path]:
         for path in files:
             os.close(regular(path))
     return files
-
-
-def _elsewhere(file: h5py.File) -> str | None:
-    """Return the name of something below the root that is a link, or stored in another file."""
-    groups, seen = [file["/"]], set()
-    while groups:
-        group = groups.pop()
-        for name in group:
-            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-                return f"{group.name}/{name}".replace("//", "/")
-            member = group[name]
-            if isinstance(member, h5py.Dataset) and (member.external or member.is_virtual):
-                return str(member.name)
-            if isinstance(member, h5py.Group) and member.id not in seen:  # hard links can make a circle
-                seen.add(member.id)
-                groups.append(member)
-    return None
 
 
 def open_parsed(dataset_id: str) -> MinariDataset:

@@ -99,13 +99,12 @@ def local_ids(unreadable: Callable[[OSError], None] | None = None) -> list[str]:
     """
     base, ids, seen = root(), list[str](), set[str]()
     for folder, folders, _ in os.walk(base, onerror=unreadable, followlinks=True):
-        if (real := os.path.realpath(folder)) in seen:  # links can make a circle
-            folders.clear()
-            continue
-        seen.add(real)
         if os.path.isfile(os.path.join(folder, "data", "metadata.json")):
             ids.append(os.path.relpath(folder, base))
             folders.clear()
+        if (real := os.path.realpath(folder)) in seen:  # links can make a circle
+            folders.clear()
+        seen.add(real)
         replaced = {match[1] for name in folders if (match := OLD.fullmatch(name))} - set(folders)
         folders[:] = [name for name in folders if not name.startswith(".")]
         folders += [name for name in replaced if _put_back(Path(folder, name))]

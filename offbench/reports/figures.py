@@ -21,7 +21,7 @@ from offbench.analysis.results import REFERENCES, Entry, Results, Task, read_res
 from offbench.analysis.statistics import Estimate, curve, iqm, profile
 from offbench.common.arrays import Array
 from offbench.common.plotting import figure, picture_file, save
-from offbench.common.scores import LAST
+from offbench.common.scores import LARGEST, LAST
 from offbench.common.text import compact, printable
 from offbench.reports.tables import Aggregates
 
@@ -229,7 +229,8 @@ def _column(entry: Entry, column: str) -> tuple[list[int], Array] | None:
     steps = steps[:: max(1, len(steps) // 200)]
     if not steps:
         return None
-    return steps, np.array([[run[step] for step in steps] for run in series])
+    values = np.array([[run[step] for step in steps] for run in series])
+    return steps, np.where(np.abs(values) < LARGEST, values, np.nan)  # of a run that diverges; no axis is as long
 
 
 def _band(axes: Axes, x: Sequence[float], points: Sequence[Estimate], look: Line) -> None:

@@ -45,6 +45,7 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {  # in place
 }
 NETWORKS = ("layers", "critic")
 MOST_SAMPLES = 10_000  # actions to choose from; more would fill the memory
+MOST_VALUES = 4_000_000  # samples times the width of the critic
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # Stable-Baselines3's bounds, and CQL's
 
 
@@ -303,6 +304,9 @@ def check_networks(parts: Policy | PolicyParts, observations: int, actions: int)
     _check_layers(parts.layers, observations, actions * (1 if parts.kind == "tanh" else 2))
     if parts.kind == "best_by_q":
         _check_layers(parts.critic, observations + actions, 1)
+        widest = max(len(bias) for _, bias in parts.critic)
+        if parts.samples * widest > MOST_VALUES:
+            raise ValueError(f"{parts.samples} samples for a critic of width {widest} would fill the memory")
 
 
 def _check_layers(layers: Sequence[tuple[Array, Array] | tuple[Tensor, Tensor]], inputs: int, outputs: int) -> None:

@@ -117,9 +117,11 @@ class _Lane:
         self.noise: Array = np.empty((0, 0))
 
     def next_noise(self) -> Array:
-        position = len(self.actions) % NOISE_BLOCK
+        # fewer where each takes many numbers, which are the same in blocks of any size
+        block = max(1, NOISE_BLOCK // getattr(self.policy, "samples", 1))
+        position = len(self.actions) % block
         if position == 0:
-            self.noise = self.policy.draw(self.rng, NOISE_BLOCK)
+            self.noise = self.policy.draw(self.rng, block)
         row: Array = self.noise[position]
         return row
 

@@ -25,7 +25,7 @@ from offbench.common.files import read_json
 from offbench.common.processes import cores
 from offbench.common.provenance import hardware, versions
 from offbench.data import minari_store, transitions
-from offbench.envs.environments import make_env
+from offbench.envs.environments import make_env, spaces_of
 from offbench.envs.recipes import load_recipe
 from offbench.rollouts.rollouts import Episode
 
@@ -133,8 +133,8 @@ def replay_error(count: int) -> float:
     assert folder is not None
     ladder = folder / "behaviour"
     digest = read_json(ladder / "ladder.json")["medium_replay"]["sha256"]
-    space = env.action_space
-    episodes = load_replay(ladder / "medium-replay.hdf5", digest, space.low, space.high, np.float64)  # type: ignore[attr-defined]
+    observations, actions = spaces_of(env, "hopper")
+    episodes = load_replay(ladder / "medium-replay.hdf5", digest, observations, actions.low, actions.high)
     env.reset(seed=0)
     errors: list[float] = []
     for before, action, after in _spread(episodes, count):

@@ -186,8 +186,8 @@ class Run:
             raise OffbenchError(f"{reason}; {TRAIN_ANEW}")
 
     def check_claimed(self, config: RunConfig) -> None:
-        """Check, with the lock held, that this is the run of `config`. Raises OffbenchError if it is not."""
-        if reason := self._refusal(config):
+        """Check, with the lock held, that this is the run of `config`, of any code. Raises OffbenchError if not."""
+        if reason := self._refusal(dataclasses.replace(config, code=self.config().code)):
             raise OffbenchError(f"{reason}; run the command again")
 
     def claim(self, config: RunConfig) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch import Tensor
 from offbench.algorithm.interface import Algorithm, PolicyParts, stack_configs
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
+from offbench.common.settings import shown
 from offbench.data.transitions import Transitions
 from offbench.rollouts.policy import Policy, check_networks
 from offbench.training.batches import CHUNK, Store, draw_chunk
@@ -105,13 +107,7 @@ class Stack:
 
     def load(self, run: int, tensors: Mapping[str, Tensor], state: JsonObject) -> None:
         """Put one run's checkpoint back. Raises OffbenchError if it does not fit, or is of another run."""
-        recorded = state.get("origin", {})  # earlier versions wrote none, or not all of it
-        for key, value in self.identity(run).items():
-            if (found := recorded.get(key, value)) != value:
-                raise OffbenchError(
-                    f"the checkpoint in {self.specs[run].folder} is of another run: its {key} is {found}, not "
-                    f"{value}; put the run's own back, or delete the run to repeat it"
-                )
+        check_origin(self.specs[run].folder, state, self.identity(run))
         for name, tensor in self.run_tensors(run).items():
             saved = tensors.get(name)
             if saved is None or saved.shape != tensor.shape:
@@ -146,3 +142,14 @@ def _check_policy(algorithm: Algorithm, observation_dim: int, action_dim: int) -
 def slice_of(tensors: Mapping[str, Tensor], run: int) -> dict[str, Tensor]:
     """Return one run's part of a stack's tensors."""
     return {name: value if value.dim() == 0 else value[:, run : run + 1] for name, value in tensors.items()}
+
+
+def check_origin(folder: Path, state: JsonObject, identity: JsonObject) -> None:
+    """Raise OffbenchError if a checkpoint's state is of another run or settings than `identity` says."""
+    recorded = state.get("origin", {})  # earlier versions wrote none, or not all of it
+    for key, value in identity.items():
+        if (found := recorded.get(key, value)) != value:
+            raise OffbenchError(
+                f"the checkpoint in {folder} is of another run: its {key} is {shown(found)}, not {shown(value)}; put "
+                "the run's own back, or delete the run to repeat it"
+            )

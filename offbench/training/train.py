@@ -24,8 +24,8 @@ from offbench.training.loggers import NOWHERE, Destinations
 from offbench.training.registry import algorithm_names, current_settings, is_local, load_algorithm, use
 from offbench.training.run import Run
 from offbench.training.source_code import changes, code_of
-from offbench.training.spec import Job, RunSpec, Times, specs_of
-from offbench.training.stack import Stack
+from offbench.training.spec import Job, RunSpec, Times, settings_json, specs_of
+from offbench.training.stack import Stack, check_origin
 
 
 def train(
@@ -227,6 +227,7 @@ def restore(run: Run, algorithm: str | type | None = None) -> Stack:
         raise OffbenchError(f"{run.folder} has no checkpoint yet; train it to its first one")
     tensors, state = newest
     times = config.steps, config.eval_every, config.eval_episodes
+    check_origin(run.folder, state, settings_json(settings))  # before networks of that size are made
     spec = RunSpec(config.algorithm, settings, config.dataset, config.seed, *times, run.folder)
     stack = Stack(kind, [spec], {config.dataset: data}, "cpu")
     stack.load(0, tensors, state)

@@ -38,7 +38,7 @@ for name, size in STATES.items():
     folder = recipe.folder / "behaviour"
     digest = read_json(folder / "ladder.json")["medium_replay"]["sha256"]
     episodes = load_replay(
-        folder / "medium-replay.hdf5", digest, env.action_space.low, env.action_space.high, np.float64
+        folder / "medium-replay.hdf5", digest, env.observation_space, env.action_space.low, env.action_space.high
     )
     errors[name] = []
     positions = inner.model.nq - hidden
