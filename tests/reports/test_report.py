@@ -319,7 +319,7 @@ def test_a_damaged_config_is_said(home: Path, damage: dict[str, Any]) -> None:
         offbench.report(home / "runs", home / "out")
 
 
-@pytest.mark.parametrize("beta", [{"a": 1}, 10**400, "$\\frac$", "y" * 10**6])
+@pytest.mark.parametrize("beta", [{"a": 1}, 10**400, "$\\frac$"])
 def test_an_odd_beta_is_shown_as_it_is(home: Path, beta: object) -> None:
     run = made_run(home / "runs", "hopper-medium-v0", "bdb", "odd=1", 0, 50)
     write_json(run.config_path, json.loads(run.config_path.read_text()) | {"settings": {"beta": beta}})
