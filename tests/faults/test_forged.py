@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
@@ -15,12 +16,14 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 import offbench
+from offbench.analysis.normalize import render
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
 from offbench.common.files import sha256_of
+from offbench.common.seeds import Purpose, generator
 from offbench.evaluation.similarity import similarity
-from offbench.rollouts import rollouts
 from offbench.rollouts.policy import MOST_VALUES, Policy
+from offbench.rollouts.rollouts import NOISE_BLOCK, Task, _Lane
 from offbench.training.run import Run
 from tests.made_runs import made_run
 
@@ -125,7 +128,7 @@ def test_a_beta_of_several_lines_is_one_line(home: Path) -> None:
     config = json.loads(run.config_path.read_text())
     config["settings"]["beta"] = "x\n| forged | 99.9 |" + "y" * 10**5
     run.config_path.write_text(json.dumps(config))
-    lines = offbench.normalize.__globals__["render"](offbench.normalize(home / "runs")).splitlines()
+    lines = render(offbench.normalize(home / "runs")).splitlines()
     assert not [line for line in lines if line.startswith("| forged")]
     assert max(map(len, lines)) < 400
 
@@ -137,26 +140,34 @@ def test_losses_of_any_size_are_drawn(values: tuple[float, float], home: Path) -
     assert offbench.report(home / "runs", home / "out").exists()
 
 
-def test_noise_is_the_same_in_blocks_of_any_size() -> None:
-    draws = [np.random.default_rng(0).standard_normal((1024, 100, 3))]
-    rng = np.random.default_rng(0)
-    draws.append(np.concatenate([rng.standard_normal((10, 100, 3)) for _ in range(103)])[:1024])
-    assert np.array_equal(*draws)
-    assert rollouts.NOISE_BLOCK == 1024
+def best_by_q(samples: int, width: int) -> Policy:
+    """A policy of zeros for InvertedPendulum: 4 observations, 1 action."""
+    actor = ((np.zeros((4, 2), np.float32), np.zeros(2, np.float32)),)
+    critic = ((np.zeros((5, width), np.float32), np.zeros(width, np.float32)),)
+    critic += ((np.zeros((width, 1), np.float32), np.zeros(1, np.float32)),)
+    zeros, ones = np.zeros(4, np.float32), np.ones(1, np.float32)
+    name = "InvertedPendulum-v5"
+    return Policy("best_by_q", actor, zeros, zeros + 1, -ones, ones, name, critic=critic, samples=samples)
+
+
+@pytest.mark.parametrize("samples", [1, 100, 5000])
+def test_noise_is_drawn_in_blocks_that_change_no_number(samples: int) -> None:
+    policy, task = best_by_q(samples, 8), Task("", b"", 0, (), (0,), False)
+    with gym.make(policy.env_id) as env:
+        lane = _Lane(env, policy, task, 0)
+        rows = []
+        for _ in range(30):
+            rows.append(lane.next_noise())
+            lane.actions.append(np.zeros(1))
+    expected = policy.draw(generator(0, Purpose.ACTION, 0), 30)
+    assert np.array_equal(rows, expected)
+    assert len(lane.noise) * samples <= max(NOISE_BLOCK, samples)
 
 
 def test_a_policy_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
-    def policy(samples: int, width: int) -> Policy:
-        ones = np.ones(1, np.float32)
-        actor = ((np.zeros((2, 2), np.float32), np.zeros(2, np.float32)),)
-        critic = ((np.zeros((3, width), np.float32), np.zeros(width, np.float32)),)
-        critic += ((np.zeros((width, 1), np.float32), np.zeros(1, np.float32)),)
-        zeros = np.zeros(2, np.float32)
-        return Policy("best_by_q", actor, zeros, zeros + 1, -ones, ones, "X-v0", critic=critic, samples=samples)
-
-    policy(100, 256).save(tmp_path / "small.safetensors")
+    best_by_q(100, 256).save(tmp_path / "small.safetensors")
     offbench.load_policy(tmp_path / "small.safetensors")
     path = tmp_path / "large.safetensors"
-    policy(10_000, MOST_VALUES // 10_000 + 1).save(path)
+    best_by_q(10_000, MOST_VALUES // 10_000 + 1).save(path)
     with pytest.raises(OffbenchError, match="would fill the memory"):
         offbench.load_policy(path)
