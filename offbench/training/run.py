@@ -241,8 +241,8 @@ class Run:
         """Delete what the folder holds, if it holds a run, so that it is trained again; config.json goes last."""
         if self.config_path.exists():
             with self.locked():
-                # what a killed process leaves must not be taken for a finished run
-                early = [self.folder / "similarity.json", *self.folder.glob("checkpoint-*")]
+                # newest checkpoint first: what a killed process leaves must not be taken for a finished run
+                early = [self.folder / "similarity.json", *sorted(self.folder.glob("checkpoint-*"), reverse=True)]
                 late = {*self.folder.iterdir()} - {*early, self.config_path, self.folder / ".lock"}
                 for path in (*early, *late, self.config_path):
                     delete(path)
