@@ -14,6 +14,7 @@ from offbench.cli import data, results, tools, training
 from offbench.cli.arguments import Command, Parser
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import disk_errors
+from offbench.common.interrupts import stop_handlers
 from offbench.common.terminal import labeled
 from offbench.common.text import printable
 from offbench.training.registry import failure
@@ -132,7 +133,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run one command.
 
     Exits with 0, 1 if `verify` or `doctor` found a problem, 2 for an error that the user can fix, 130 after Ctrl-C,
-    143 after SIGTERM.
+    143 after SIGTERM, 129 after SIGHUP.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     if {"_ARGCOMPLETE", "COMP_LINE", "COMP_POINT"} <= os.environ.keys():  # a shell asks for completions
@@ -155,7 +156,7 @@ def _main(words: list[str]) -> None:
         resume = f"; rerun the same command{without} to resume from the last checkpoint, if there is one"
         print(file=sys.stderr)
         labeled("offbench", f"stopped{resume if _command(words) in RESUMED else ''}", "bold yellow")
-        sys.exit(143 if isinstance(stop, Terminated) else 130)
+        sys.exit(128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT))
     except BrokenPipeError:  # the reader of a pipe (`| head`) has left
         sys.exit(0)
     except Exception as error:
@@ -164,43 +165,44 @@ def _main(words: list[str]) -> None:
 
 
 class _Stream:
-    """A text stream with another `write`.
-
-    Attributes:
-        raw_stream: the stream itself, for text with colors of our own.
-    """
+    """A text stream with another `write`."""
 
     def __init__(self, stream: TextIO) -> None:
-        self.raw_stream = stream
+        self._stream = stream
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.raw_stream, name)
+        return getattr(self._stream, name)
 
 
 class _Printable(_Stream):
     """Spells out control characters of files instead of obeying them."""
 
+    @property
+    def raw_stream(self) -> TextIO:
+        """The stream itself, for text with colors of our own."""
+        return self._stream
+
     def write(self, text: str) -> int:
-        encoding = self.raw_stream.encoding or "utf-8"
+        encoding = self._stream.encoding or "utf-8"
         with disk_errors("the output"):
-            return self.raw_stream.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
+            return self._stream.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
 
     def flush(self) -> None:
         with disk_errors("the output"):
-            self.raw_stream.flush()
+            self._stream.flush()
 
 
 class _Lossy(_Stream):
-    """Drops what cannot be written: a training goes on although its log file is on a full disk."""
+    """Drops what cannot be written: a training goes on although its log's disk is full, or its terminal closed."""
 
     def write(self, text: str) -> int:
         with _lost():
-            self.raw_stream.write(text)
+            self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
         with _lost():
-            self.raw_stream.flush()
+            self._stream.flush()
 
 
 @contextlib.contextmanager
@@ -247,34 +249,44 @@ def _drop_unwritten() -> None:
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM came: from Slurm at its time limit, from a container that is stopped."""
+    """SIGTERM (Slurm's time limit, a stopped container) or SIGHUP (a closed terminal) came.
+
+    Attributes:
+        number: the signal's.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
 
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """Let SIGTERM end a command as Ctrl-C does: its processes end too, and a line is printed."""
+    """Let SIGTERM and SIGHUP end a command as Ctrl-C does: its processes end too, and a line is printed."""
 
-    def stop(*_: object) -> NoReturn:
-        raise Terminated
+    def stop(number: int, _: object) -> NoReturn:
+        if number != signal.SIGTERM:
+            signal.signal(number, signal.SIG_IGN)  # a closed terminal may send SIGHUP twice
+        raise Terminated(number)
 
     def again(ignored: sys.UnraisableHookArgs) -> None:
         if isinstance(ignored.exc_value, KeyboardInterrupt):
-            number = signal.SIGTERM if isinstance(ignored.exc_value, Terminated) else signal.SIGINT
+            number = getattr(ignored.exc_value, "number", signal.SIGINT)
             threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
         else:
             hook(ignored)
 
-    try:
-        before = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # only the main thread may
-        yield
-        return
+    before = {number: handler for number, handler in stop_handlers().items() if number != signal.SIGINT}
+    for number in before:
+        signal.signal(number, stop)
     hook, sys.unraisablehook = sys.unraisablehook, again  # a stop within `__del__` or a callback would be lost
     try:
         yield
     finally:
         sys.unraisablehook = hook
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            if signal.getsignal(number) == stop:
+                signal.signal(number, handler)
 
 
 class _MainParser(Parser):

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: collected while something is finished first, such as a checkpoint, and then raised again.
+"""Ctrl-C, SIGTERM and SIGHUP: collected while something is finished first, such as a checkpoint, then raised again.
 
 offbench.training.trainer writes the checkpoint, offbench.training.jobs ends the worker processes.
 """
@@ -13,13 +13,27 @@ import threading
 import traceback
 import types
 from collections.abc import Collection, Iterator
+from typing import Any
 
-STOPS = {signal.SIGINT, signal.SIGTERM}
+# SIGHUP comes when a terminal or an SSH connection is closed; Windows has none
+STOPS = {signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
+
+
+def stop_handlers() -> dict[signal.Signals, Any]:
+    """Return the handlers of the signals that stop a command and are not ignored (as nohup ignores SIGHUP).
+
+    Empty outside the main thread, which alone may set handlers.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    handlers = {stop: signal.getsignal(stop) for stop in STOPS}
+    # None is a handler that Python cannot restore
+    return {stop: handler for stop, handler in handlers.items() if handler not in (None, signal.SIG_IGN)}
 
 
 @contextlib.contextmanager
 def stops_delayed() -> Iterator[None]:
-    """Delay Ctrl-C and SIGTERM until the end.
+    """Delay Ctrl-C, SIGTERM and SIGHUP until the end.
 
     The started process inherits the signal mask. In this process the mask alone is not enough: another thread, such as
     a library's, may take the signal, and Python's handler still runs in the main thread.
@@ -36,7 +50,7 @@ def stops_delayed() -> Iterator[None]:
 
 @contextlib.contextmanager
 def stops_noted(second_at_once: bool = False, within: Collection[types.CodeType] | None = None) -> Iterator[list[int]]:
-    """Collect Ctrl-C and SIGTERM in the list that this yields, and raise the first again at the end.
+    """Collect Ctrl-C, SIGTERM and SIGHUP in the list that this yields, and raise the first again at the end.
 
     Args:
         second_at_once: let a second Ctrl-C raise KeyboardInterrupt without waiting for the end.
@@ -56,11 +70,8 @@ def stops_noted(second_at_once: bool = False, within: Collection[types.CodeType]
                 signal.default_int_handler(number, frame)
             announce_stop()
 
-    # only the main thread may set handlers; None is a handler that Python cannot restore
-    stops = STOPS if threading.current_thread() is threading.main_thread() else ()
-    handled = [stop for stop in stops if signal.getsignal(stop) not in (None, signal.SIG_IGN)]
-    handlers = {stop: signal.getsignal(stop) for stop in handled}  # before `note` is called
-    for stop in handled:
+    handlers = stop_handlers()  # before `note` is called
+    for stop in handlers:
         signal.signal(stop, note)
     try:
         yield received

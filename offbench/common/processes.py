@@ -73,8 +73,8 @@ def start_errors() -> Iterator[None]:
 def quiet_start() -> Iterator[None]:
     """Start a worker process without interruption (submitting a task may start one).
 
-    Ctrl-C and SIGTERM are delayed meanwhile, as half a start would leave the pool unusable. The user's script is
-    hidden, as a spawned process would run it again. A worker gets one thread for its matrix products: with a thread
+    Ctrl-C, SIGTERM and SIGHUP are delayed meanwhile, as half a start would leave the pool unusable. The user's script
+    is hidden, as a spawned process would run it again. A worker gets one thread for its matrix products: with a thread
     per core in each worker, recording was several times slower.
     """
     script = sys.modules["__main__"]
@@ -98,12 +98,11 @@ def start_worker(parent: int, closing: c_byte | None = None) -> None:
 
     Args:
         closing: a shared number; once it is not 0, the results of this worker are not needed any more. A worker that
-            has one leaves SIGTERM to the parent too: Slurm sends it to all processes, and a parent that saves a
-            checkpoint still waits for its evaluations.
+            has one leaves SIGTERM and SIGHUP to the parent too: Slurm and a closed terminal send them to all
+            processes, and a parent that saves a checkpoint still waits for its evaluations.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if closing is not None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for stop in STOPS if closing is not None else {signal.SIGINT}:
+        signal.signal(stop, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)  # blocked while it started
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()

@@ -39,9 +39,14 @@ class Progress:
         if is_terminal(sys.stderr):
             self._bar = bar = _bar()
             self._task = bar.add_task(what, total=total, completed=start, details=self._details(bar), note="")
-            bar.start()
 
     def __enter__(self) -> Progress:
+        if self._bar is not None:
+            try:
+                self._bar.start()
+            except BaseException:  # Ctrl-C: without this, the cursor would stay hidden
+                self._bar.stop()
+                raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, _: object, __: TracebackType | None) -> None:

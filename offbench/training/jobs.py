@@ -87,6 +87,10 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
         title = jobs[0].title if len(jobs) == 1 else f"{runs} runs"
         self.progress = Progress(sum(job.updates for job in jobs), title, work=sum(job.work for job in jobs))
 
+    def __enter__(self) -> JobProgress:
+        self.progress.__enter__()
+        return self
+
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:

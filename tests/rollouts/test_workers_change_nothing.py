@@ -200,7 +200,7 @@ def test_leaving_the_pool_ends_what_is_being_played() -> None:
     assert isinstance(future.exception(timeout=0), CancelledError)
 
 
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_stop_that_another_thread_takes_waits_until_a_worker_has_started(stop: signal.Signals) -> None:
     release, started = threading.Event(), list[bool]()
     other = threading.Thread(target=release.wait)

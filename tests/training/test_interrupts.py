@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import re
 import shlex
 import signal
@@ -69,9 +70,9 @@ def interrupted(*sent: int) -> Callable[[Stack, int], Iterator[int]]:
     return until_300
 
 
-@pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 @pytest.mark.usefixtures("ctrl_c")
-def test_ctrl_c_and_sigterm_save_a_checkpoint_where_they_arrive(
+def test_ctrl_c_sigterm_and_sighup_save_a_checkpoint_where_they_arrive(
     medium: str, sent: int, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (whole,) = train("td3_bc", medium, "whole", 600, eval_every=200)
@@ -112,6 +113,36 @@ def test_ctrl_c_after_fresh_says_how_to_keep_the_checkpoint(
     assert row["step"] == 300  # although nothing was evaluated yet
 
 
+def test_nohup_ignores_sighup(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup starts its command
+    monkeypatch.setattr(Stack, "train", interrupted(signal.SIGHUP))
+    words = ["train", "bc", "--dataset", medium, "--steps", "400", "--eval-every", "400", "--eval-episodes", "2"]
+    main([*words, "--workers", "1", "--hidden", "8", "--batch-size", "32"])
+    (run,) = find_runs(Path("runs"))
+    assert checkpoints.steps(run.folder) == [400]
+    assert signal.signal(signal.SIGHUP, before) == signal.SIG_IGN
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("ignored", "status"), [(False, 128 + signal.SIGHUP), (True, 2)])
+def test_a_closed_terminal(ignored: bool, status: int, medium: str, home: Path) -> None:
+    """It sends SIGHUP. A training that ignores this is finished, and then cannot print the run's folder."""
+    words = ["train", "td3_bc", "--dataset", medium, "--steps", "10000", "--eval-every", "10000"]
+    words += ["--eval-episodes", "2", "--hidden", "16,16", "--batch-size", "32", "--workers", "1"]
+    child, terminal = pty.fork()
+    if child == 0:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
+        os.execv(sys.executable, [sys.executable, "-m", "offbench", *words])
+    said, deadline = b"", time.monotonic() + 120
+    while not re.search(rb"[1-9][\d,]*/10,000", said) and time.monotonic() < deadline:
+        said += os.read(terminal, 1000)
+    os.close(terminal)
+    _, ended = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(ended) == status, said
+    (step,) = checkpoints.steps(home / f"runs/{medium}/td3_bc/batch_size=32,hidden=16x16/seed-0")
+    assert (step == 10_000) == ignored
+
+
 @pytest.mark.usefixtures("ctrl_c")
 def test_a_second_ctrl_c_does_not_wait_for_a_checkpoint(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Stack, "train", interrupted(signal.SIGINT, signal.SIGINT))
@@ -123,13 +154,14 @@ def test_a_second_ctrl_c_does_not_wait_for_a_checkpoint(medium: str, monkeypatch
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("sent", "status", "verb"), [(signal.SIGINT, 130, "train"), (signal.SIGTERM, 143, "benchmark")]
+    ("sent", "status", "verb"),
+    [(signal.SIGINT, 130, "train"), (signal.SIGTERM, 143, "benchmark"), (signal.SIGHUP, 129, "train")],
 )
 @pytest.mark.usefixtures("ctrl_c")
 def test_interrupted_worker_processes_save_checkpoints_too(
     medium: str, home: Path, sent: int, status: int, verb: str
 ) -> None:
-    """The whole process group gets the signal, as from a terminal, or from Slurm."""
+    """The whole process group gets the signal, as from a terminal, a closed terminal, or Slurm."""
     every, steps = 500, 3000
     settings = {"steps": steps, "eval_every": every, "eval_episodes": 2}
     if verb == "train":
