@@ -12,6 +12,7 @@ import importlib.util
 import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from types import TracebackType
 
 import numpy as np
@@ -79,7 +80,7 @@ class TensorBoard:
     def __init__(self, run: Run) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        folder = run.folder / "tensorboard"
+        folder = _folder(run, "tensorboard")
         with disk_errors(str(folder)):
             # those of an earlier session may hold steps after the checkpoint that this one resumes from
             for old in folder.glob("events.out.tfevents.*"):
@@ -117,6 +118,7 @@ class WandB:
         import wandb
 
         config = run.config()
+        _folder(run, "wandb")
         self.path, self.reference = run.folder / "wandb.json", _reference(run)
         self.state = WandBState(project, secrets.token_hex(6))
         if self.path.exists():
@@ -156,6 +158,14 @@ class WandB:
     def close(self) -> None:
         """Finish the W&B run."""
         self.run.finish()
+
+
+def _folder(run: Run, name: str) -> Path:
+    """Return where a live view writes. A link is refused: its files would be written, and deleted, elsewhere."""
+    folder = run.folder / name
+    if folder.is_symlink():
+        raise OffbenchError(f"{folder} is a link; delete it, so that {name} writes into the run's own folder")
+    return folder
 
 
 def _unsent(

@@ -176,6 +176,21 @@ def test_wandbs_refusal_is_one_line(home: Path, fake_wandb: list[FakeRun], monke
         show(run, 5000)
 
 
+@pytest.mark.parametrize("name", ["tensorboard", "wandb"])
+def test_a_run_whose_folder_of_events_is_a_link(name: str, home: Path, fake_wandb: list[FakeRun]) -> None:
+    """In a run that was handed over it may lead anywhere."""
+    pytest.importorskip("tensorboard")
+    (home / "elsewhere").mkdir()
+    (home / "elsewhere" / "events.out.tfevents.1").touch()
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
+    (run.folder / name).symlink_to(home / "elsewhere")
+    show = Destinations(tensorboard=True) if name == "tensorboard" else Destinations(wandb="project")
+    with pytest.raises(offbench.OffbenchError, match=f"{name} is a link; delete it"), Loggers([run], show):
+        pass
+    assert os.listdir(home / "elsewhere") == ["events.out.tfevents.1"]
+    assert not fake_wandb
+
+
 @pytest.mark.slow
 def test_the_real_wandb_offline(medium: str, home: Path) -> None:
     pytest.importorskip("wandb", reason="wandb is missing: pip install offbench[wandb]")
