@@ -3,15 +3,16 @@ after `make bench` (which installs d3rlpy), writes docs/results/beside-d3rlpy.md
 
 d3rlpy learns, in an environment of its own, from `offbench export --format npz`, with the settings of the grid
 `baselines`, and hands its weights over as arrays; here they play as offbench policies, 10 episodes every 5,000 updates
-as in the grid. Two processes of one thread take some three hours.
+as in the grid. Two processes of one thread take some three hours; runs whose CSV file is below docs/results are not
+repeated.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import subprocess
 import sys
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,8 @@ import numpy as np
 
 ROOT = Path(__file__).parent.parent
 PEER = ROOT / ".venv-peers" / "bin" / "python"
-FILE = ROOT / "docs" / "results" / "beside-d3rlpy.md"
+KEPT = ROOT / "docs" / "results" / "beside-d3rlpy"  # a CSV file of each run of d3rlpy's
+FILE = KEPT.with_suffix(".md")
 RUNS = ROOT / "docs" / "results" / "baselines" / "runs"
 DATASET, ENV_ID = "hopper-medium-v0", "Hopper-v5"
 ALGORITHMS = ("td3_bc", "iql", "rebrac", "bear")
@@ -144,14 +146,14 @@ def play(path: Path, env_id: str = ENV_ID) -> tuple[float, float]:
     return float(np.mean(played.returns)), float(np.mean(played.lengths))
 
 
-def ours(runs: str, algorithm: str) -> list[list[tuple[float, float]]]:
-    """Return (mean return, mean length) of each evaluation of each of our runs."""
+def ours(algorithm: str) -> list[list[tuple[float, float]]]:
+    """Return (mean return, mean length) of each evaluation of each of our kept runs."""
     from offbench.analysis.results import read_results
 
-    entries = read_results(runs).entries.items()
+    entries = read_results(RUNS).entries.items()
     found = [entry for (task, method), entry in entries if (task.dataset, method.label) == (DATASET, algorithm)]
     if len(found) != 1:
-        raise SystemExit(f"no runs of {algorithm} on {DATASET} below {runs}: run `offbench benchmark baselines`")
+        raise SystemExit(f"no runs of {algorithm} on {DATASET} below {RUNS}")
     curves = [[np.mean(run.evaluations[step], axis=0) for step in steps()] for run in found[0].runs]
     return [[(float(ret), float(length)) for ret, length in curve] for curve in curves]
 
@@ -161,43 +163,57 @@ def steps() -> range:
     return range(EVERY, STEPS + 1, EVERY)
 
 
-def theirs(folder: Path, algorithms: Sequence[str]) -> dict[str, list[list[tuple[float, float]]]]:
-    """Train and play d3rlpy's, two processes at once; what an earlier call has trained into `folder` is there."""
-    from offbench import export
+def theirs(algorithm: str, seed: int) -> list[tuple[float, float]] | None:
+    """Return (mean return, mean length) of each evaluation of a run of d3rlpy's, None if it is not kept."""
+    path = KEPT / f"{algorithm}-{seed}.csv"
+    if not path.exists():
+        return None
+    with open(path, newline="") as file:
+        return [(float(row["return"]), float(row["length"])) for row in csv.DictReader(file)]
 
-    folder.mkdir(parents=True, exist_ok=True)
-    data = export(DATASET, folder / "data.npz", style="npz")
 
-    def run(algorithm: str, seed: int) -> list[tuple[float, float]]:
-        place = folder / algorithm / str(seed)
-        if not (place / f"{STEPS}.npz").exists():
-            place.mkdir(parents=True, exist_ok=True)
-            subprocess.run([PEER, __file__, "learn", algorithm, data, str(seed), place], check=True)
-        return [play(place / f"{step}.npz") for step in steps()]
+def learn_and_play(algorithm: str, seed: int, data: Path, folder: Path) -> None:
+    """Train d3rlpy's algorithm into `folder`, unless an earlier call has, and keep what its policies do here."""
+    from offbench.common.files import csv_bytes, write_bytes
 
-    with ThreadPoolExecutor(2) as pool:
-        jobs = {name: [pool.submit(run, name, seed) for seed in range(SEEDS)] for name in algorithms}
-        return {name: [job.result() for job in of_name] for name, of_name in jobs.items()}
+    place = folder / algorithm / str(seed)
+    if not (place / f"{STEPS}.npz").exists():
+        place.mkdir(parents=True, exist_ok=True)
+        subprocess.run([PEER, __file__, "learn", algorithm, data, str(seed), place], check=True)
+    rows = [(step, *play(place / f"{step}.npz")) for step in steps()]
+    write_bytes(KEPT / f"{algorithm}-{seed}.csv", csv_bytes(("step", "return", "length"), rows))
+
+
+def table() -> str:
+    """Return the table of our kept runs beside theirs."""
+    from offbench.common.tables import markdown
+
+    header = ["hopper-medium-v0", "", "seed", *(f"{step:,}" for step in steps()), "mean return"]
+    rows = []
+    for name in ALGORITHMS:
+        peers = [curve for seed in range(SEEDS) if (curve := theirs(name, seed))]
+        for library, curves in (("offbench", ours(name) if peers else []), ("d3rlpy 2.8.1", peers)):
+            for seed, curve in enumerate(curves):
+                cells = [f"{ret:,.0f} ({length:.0f})" for ret, length in curve]
+                rows.append([name, library, str(seed), *cells, f"{np.mean([ret for ret, _ in curve]):,.0f}"])
+    return "\n".join(markdown(header, rows)) + "\n"
 
 
 def main() -> None:
-    """Write the table."""
-    from offbench.common.tables import markdown
+    """Train what is not kept yet, two processes at once, and write the table."""
+    from offbench import export
 
     parser = argparse.ArgumentParser(prog="python -m tests.beside_d3rlpy", description=__doc__)
-    parser.add_argument("--runs", default=RUNS, help="runs of `offbench benchmark baselines` (default: those kept)")
     parser.add_argument("--folder", default=ROOT / "runs" / "d3rlpy", type=Path, help="of what d3rlpy has learned")
     parser.add_argument("algorithms", nargs="*", default=ALGORITHMS, help=f"default: {' '.join(ALGORITHMS)}")
     args = parser.parse_args()
-    curves = {(name, "offbench"): ours(args.runs, name) for name in args.algorithms}
-    curves |= {(name, "d3rlpy 2.8.1"): found for name, found in theirs(args.folder, args.algorithms).items()}
-    header = ["hopper-medium-v0", "", "seed", *(f"{step:,}" for step in steps()), "mean return"]
-    rows = []
-    for name, library in sorted(curves, key=lambda key: args.algorithms.index(key[0])):
-        for seed, curve in enumerate(curves[name, library]):
-            cells = [f"{ret:,.0f} ({length:.0f})" for ret, length in curve]
-            rows.append([name, library, str(seed), *cells, f"{np.mean([ret for ret, _ in curve]):,.0f}"])
-    FILE.write_text("\n".join(markdown(header, rows)) + "\n")
+    args.folder.mkdir(parents=True, exist_ok=True)
+    data = export(DATASET, args.folder / "data.npz", style="npz")
+    missing = [(name, seed) for name in args.algorithms for seed in range(SEEDS) if theirs(name, seed) is None]
+    with ThreadPoolExecutor(2) as pool:
+        for job in [pool.submit(learn_and_play, name, seed, data, args.folder) for name, seed in missing]:
+            job.result()
+    FILE.write_text(table())
 
 
 if __name__ == "__main__":
