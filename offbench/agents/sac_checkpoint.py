@@ -59,7 +59,7 @@ def _keep_newest(folder: TrainingFolder, newest: int) -> None:
     for step in checkpoints.steps(folder.path):
         if step % folder.recipe.sac.segment and step != newest:
             checkpoints.path_of(folder.path, step).unlink(missing_ok=True)
-    checkpoints.keep_newest(folder.path)
+    checkpoints.keep_newest(folder.path, newest)
 
 
 def restore(folder: TrainingFolder, model: SAC, start_segment: Callable[[int], None]) -> float:

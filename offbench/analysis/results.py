@@ -27,6 +27,7 @@ from offbench.common.scores import LAST, Evaluations, mean_std, normalize, run_r
 from offbench.common.terminal import warn
 from offbench.common.text import from_to, plural
 from offbench.data.levels import LEVELS
+from offbench.envs.environments import same_environment
 from offbench.training.run import DIGITS, Run, RunConfig, find_runs
 
 # the order of the BDB paper's Table 1; levels are in its order already
@@ -278,7 +279,7 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
     Damaged runs are named on stderr and left out.
 
     Raises:
-        OffbenchError: one is there twice, or none but damaged ones is evaluated.
+        OffbenchError: one is there twice, two do not compare, or none but damaged ones is evaluated.
     """
     groups: dict[tuple[str, str, str, str], list[Trained]] = {}
     waiting = []
@@ -325,9 +326,27 @@ def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[Trained]]) -> dic
     ids = [dataset for dataset, _ in runs]
     tasks = {}
     for (dataset, content), group in runs.items():
+        kinds = {(t.config.env_spec, *t.config.references.items()): t for t in group}
+        for one, other in itertools.combinations(kinds.values(), 2):
+            _check_evaluated_alike(one, other)
         references = [name for name in ("dataset", "d4rl") if all(t.config.references.get(name) for t in group)]
         tasks[dataset, content] = Task(dataset, content, references[0] if references else None, ids.count(dataset) > 1)
     return tasks
+
+
+def _check_evaluated_alike(one: Trained, other: Trained) -> None:
+    """Refuse two runs on the same data whose returns, or scores, do not compare."""
+    a, b = one.config, other.config
+    if a.env_spec and b.env_spec and not same_environment(a.env_spec, b.env_spec):
+        differ = "were evaluated in different environments"
+    elif any(pair and b.references.get(name) not in (None, pair) for name, pair in a.references.items()):
+        differ = "have different reference scores"
+    else:
+        return
+    raise OffbenchError(
+        f"{one.run.folder} and {other.run.folder} are runs on the same data but {differ} (see env_spec and references "
+        "in their config.json), so their scores do not compare; give a folder without one of them"
+    )
 
 
 def _check_seeds(runs: Sequence[Trained]) -> None:

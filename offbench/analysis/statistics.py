@@ -113,7 +113,7 @@ def paired(differences: Scores) -> Paired:
     spread = float(every.std(ddof=1)) if len(every) > 1 else 0.0
     return Paired(
         _estimate([differences], lambda drawn: _mean_of_means(drawn[0]), RESAMPLES),
-        float(every.mean()) / spread if spread else None,
+        float(every.mean()) / spread if spread > 1e-12 * np.abs(every).max() else None,  # less is rounding
         _sign_flip(differences),
         len(every),
     )

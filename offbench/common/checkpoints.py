@@ -83,7 +83,9 @@ def load_newest(folder: Path) -> tuple[dict[str, torch.Tensor], JsonObject] | No
     return next((checkpoint for step in steps(folder) if (checkpoint := load_checkpoint(folder, step))), None)
 
 
-def keep_newest(folder: Path) -> None:
-    """Delete all but the newest checkpoints."""
-    for step in steps(folder)[KEPT:]:
-        path_of(folder, step).unlink(missing_ok=True)
+def keep_newest(folder: Path, newest: int) -> None:
+    """Delete all checkpoints but the newest two up to step `newest`; those of later steps are damaged."""
+    kept = [step for step in steps(folder) if step <= newest][:KEPT]
+    for step in steps(folder):
+        if step not in kept:
+            path_of(folder, step).unlink(missing_ok=True)

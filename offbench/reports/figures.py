@@ -226,7 +226,7 @@ def _column(entry: Entry, column: str) -> tuple[list[int], Array] | None:
         {int(row["step"]): row[column] for row in t.losses if {"step", column} <= row.keys()} for t in entry.runs
     ]
     steps = sorted(set.intersection(*(set(run) for run in series)))
-    steps = steps[:: max(1, len(steps) // 200)]
+    steps = steps[:: -max(1, len(steps) // 200)][::-1]  # the last one is kept
     if not steps:
         return None
     values = np.array([[run[step] for step in steps] for run in series])

@@ -239,6 +239,8 @@ def iqm_table(results: Results, iqms: Aggregates) -> Table:
             "On some tasks the scores are of evaluations at different steps (the table of scores says which): the "
             "IQMs cannot be compared."
         )
+    if len({task.reference for task in results.tasks if task.reference}) > 1:
+        notes.append("The tasks' scores are normalized by different references (the table of scores says which).")
     header = ["method", "IQM", "95% low", "95% high", "tasks", "runs"]
     return Table("iqm", "Interquartile mean over tasks", header, rows, notes)
 

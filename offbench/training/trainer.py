@@ -80,9 +80,10 @@ class Trainer:
                 resources.enter_context(run.locked())
             for run, spec, data in zip(self.runs, self.job.specs, self.stack.data, strict=True):
                 run.check_claimed(run_config(spec, data, self.job.device, ""))
-                checkpoints.keep_newest(run.folder)  # a killed process may have left one more
             self._resume()
             for run in self.runs:
+                if self.stack.step:
+                    checkpoints.keep_newest(run.folder, self.stack.step)  # a killed process may have left one more
                 run.begin(self.stack.step, steps, self.made)
             self.configs = [read_bytes(run.config_path) for run in self.runs]
             resources.enter_context(self.loggers)
@@ -190,7 +191,7 @@ class Trainer:
                 if unlogged:  # stopped by the clock, between two rows of losses.csv
                     state["unlogged"] = unlogged
                 checkpoints.save_checkpoint(run.folder, step, slice_of(tensors, i), state)
-                checkpoints.keep_newest(run.folder)
+                checkpoints.keep_newest(run.folder, step)
         self._show()
         self._saved = time.monotonic()
         self._save_seconds = self._saved - began

@@ -70,6 +70,8 @@ def write_run(
     *,
     runs: str = "runs",
     content: str = "ab" * 32,
+    expert: float = 200.0,
+    env_spec: str | None = None,
 ) -> None:
     run = Run(Path(runs) / "x-v0" / "bdb" / variant / f"seed-{seed}")
     config: dict[str, Any] = {
@@ -79,7 +81,8 @@ def write_run(
         "variant": variant,
         "seed": seed,
     }
-    references = {"dataset": [0.0, 200.0], "d4rl": d4rl}
+    references = {"dataset": [0.0, expert], "d4rl": d4rl}
+    config |= {"env_spec": env_spec}
     config |= {"settings": {}, "dataset_sha256": content, "eval_every": 100, "eval_episodes": len(returns)}
     run.folder.mkdir(parents=True)
     run.claim(RunConfig(**config, references=references, steps=100))
@@ -102,6 +105,25 @@ def test_the_table_of_runs_by_hand() -> None:
     # two seeds, 50 and 30: the mean resamples to 30, 40, 50 with 1/4, 1/2, 1/4
     assert (two["iqm"], two["iqm_low"], two["iqm_high"]) == (40.0, 30.0, 50.0)
     assert (one["iqm"], one["iqm_low"], one["iqm_high"]) == (100.0, None, None)
+
+
+@pytest.mark.parametrize(
+    ("differ", "how"),
+    [
+        ({"expert": 100.0}, "have different reference scores"),
+        ({"d4rl": (-10.0, 200.0)}, "have different reference scores"),
+        ({"env_spec": '{"id": "X-v0", "kwargs": {"mass": 2}}'}, "were evaluated in different environments"),
+        ({"env_spec": '{"id": "X-v0", "contact_margin": "sum"}'}, "were evaluated in different environments"),
+    ],
+)
+def test_runs_whose_scores_do_not_compare_are_refused(differ: dict[str, Any], how: str) -> None:
+    """The same data may have been imported anew, by another version or on another MuJoCo."""
+    write_run(0, [90.0], env_spec='{"id": "X-v0"}')
+    write_run(1, [90.0], d4rl=None)
+    assert len(offbench.normalize("runs")) == 1  # what is unknown may be the same
+    write_run(2, [90.0], **({"env_spec": '{"id": "X-v0"}'} | differ))
+    with pytest.raises(offbench.OffbenchError, match=f"seed-0 and .*seed-2 .*{how}"):
+        offbench.normalize("runs")
 
 
 def test_returns_of_an_environment() -> None:

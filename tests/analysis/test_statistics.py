@@ -96,6 +96,8 @@ def test_paired_weighs_tasks_equally() -> None:
 def test_a_difference_that_does_not_vary_is_not_standardized() -> None:
     found = paired({"one": [0.0, 0.0]})
     assert (found.difference, found.standardized, found.p) == (Estimate(0.0, 0.0, 0.0), None, 1.0)
+    rounded = paired({"one": [0.1 + 0.2, 0.3, 0.3]})
+    assert rounded.standardized is None
     alone = paired({"one": [5.0]})
     assert (alone.difference, alone.standardized, alone.p) == (Estimate(5.0), None, 1.0)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -174,6 +175,18 @@ def test_only_d4rls_reference_is_named(home: Path) -> None:
     made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, references=(None, [0.0, 100.0]))
     page = Page(offbench.report(home / "runs", home / "out"))
     assert "normalized by D4RL's constants" in page.text
+
+
+def test_an_iqm_over_several_references_is_marked(home: Path) -> None:
+    for dataset, references in {"hopper-medium-v0": ([0, 100], None), "walker2d-medium-v0": (None, [0, 100])}.items():
+        made_run(home / "runs", dataset, "td3_bc", "default", 0, 50, references=references)
+    assert "normalized by different references" in Page(offbench.report(home / "runs", home / "out")).text
+
+
+def test_the_picture_of_a_long_training_has_its_last_step(home: Path) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, steps=600_000)
+    text = offbench.report(home / "runs", home / "out").read_text()
+    assert re.search(r"over training on hopper-medium-v0\. At the end: td3_bc [\d.]+ at 600,000", text)
 
 
 def test_unfinished_and_unbegun_runs_are_marked(home: Path) -> None:

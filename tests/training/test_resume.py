@@ -208,6 +208,24 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(
     assert_same_files(run, whole)
 
 
+def test_damaged_checkpoints_do_not_outlive_the_new_ones(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If they counted as the newest two, every new one would be deleted as soon as it is written."""
+    (run,) = train("td3_bc", medium, "runs", 300)
+    for step in (200, 300):
+        (run.folder / f"checkpoint-{step:09d}.safetensors").write_bytes(b"damaged")
+    save = checkpoints.save_checkpoint
+
+    def stopped(folder: Path, step: int, *content: Any) -> None:
+        if step == 200:
+            raise KeyboardInterrupt
+        save(folder, step, *content)
+
+    monkeypatch.setattr(checkpoints, "save_checkpoint", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        train("td3_bc", medium, "runs", 400)
+    assert checkpoints.steps(run.folder) == [100]
+
+
 def test_another_run_in_the_same_place_is_refused(tiny: tuple[str, str], medium: str) -> None:
     train("td3_bc", medium, "runs", 100)
     with pytest.raises(OffbenchError, match="--eval-episodes 2, not 3"):
