@@ -23,6 +23,7 @@ from offbench.common.scores import LARGEST, are_references, normalize
 from offbench.common.settings import read_back
 from offbench.common.terminal import inform, warn
 from offbench.envs.environments import same_environment
+from offbench.envs.margin_rule import EARLIER
 from offbench.envs.recipes import Recipe, load_recipe, names
 from offbench.envs.version_warning import warn_other_physics
 from offbench.rollouts.policy import Policy, load_policy
@@ -72,6 +73,7 @@ class LadderInfo:
     references: dict[str, dict[str, int | float]]
     levels: dict[str, int]
     medium_replay: Replay
+    contact_margin: str = EARLIER
     seed: int = 0
     steps: int = 0
     hours: float = 0.0
@@ -124,10 +126,13 @@ class Ladder:
     def check(self, recipe: Recipe) -> Ladder:
         """Return itself; raise OffbenchError if it is of another environment than the recipe."""
         kwargs = json.loads(json.dumps(dict(recipe.env_kwargs)))
-        if (self.info.env_id, self.info.env_kwargs) != (recipe.env_id, kwargs):
+        mine = (self.info.env_id, self.info.env_kwargs, self.info.contact_margin)
+        wanted = (recipe.env_id, kwargs, recipe.contact_margin)
+        if mine != wanted:
+            ours, its = (f"{name} {arguments} with contact_margin {rule}" for name, arguments, rule in (mine, wanted))
             raise OffbenchError(
-                f"the ladder in {self.folder} is of {self.info.env_id} {self.info.env_kwargs}, "
-                f"the recipe is of {recipe.env_id} {kwargs}; delete that folder, or rename the recipe"
+                f"the ladder in {self.folder} is of {ours}, the recipe is of {its}; delete that folder, or rename "
+                "the recipe"
             )
         return self
 

@@ -48,7 +48,9 @@ from offbench.common.interrupts import stops_noted
 from offbench.common.progress import Progress, duration
 from offbench.common.provenance import hardware, versions
 from offbench.common.seeds import Purpose
+from offbench.common.terminal import warn
 from offbench.envs.environments import Env, make_env
+from offbench.envs.margin_rule import EARLIER
 from offbench.envs.recipes import Recipe, SACSettings
 from offbench.rollouts.policy import Policy
 from offbench.rollouts.rollouts import MEASURES, Named, Rollouts, gathered, summary
@@ -79,6 +81,7 @@ def _check_identity(folder: TrainingFolder) -> None:
     """Write what is trained in this folder, or check that it is the same as when it was started."""
     recipe = dataclasses.asdict(folder.recipe)
     identity = {"seed": folder.seed, "env_id": recipe["env_id"], "env_kwargs": dict(recipe["env_kwargs"])}
+    identity["contact_margin"] = recipe["contact_margin"]
     identity["sac"] = recipe["sac"] | {"hidden": list(recipe["sac"]["hidden"])}
     path = folder.path / "training.json"
     if not path.exists():
@@ -87,6 +90,7 @@ def _check_identity(folder: TrainingFolder) -> None:
         )
         return
     recorded = read_json(path, f"delete {folder.path} to train the agent again")
+    recorded = {"contact_margin": EARLIER} | recorded  # the only rule of earlier versions
     started = _flat({key: value for key, value in recorded.items() if key in identity})
     wanted = _flat(json.loads(json.dumps(identity)))
     changed = [key for key in started | wanted if started.get(key) != wanted.get(key)]
@@ -95,6 +99,15 @@ def _check_identity(folder: TrainingFolder) -> None:
         raise OffbenchError(
             f"{folder.path} holds another training, with {changed[0]} {old}, not {new}; delete it to train again "
             "(to train for longer, keep the recipe: `offbench behaviour ENV --steps N`)"
+        )
+
+
+def _say_other_versions(folder: TrainingFolder) -> None:
+    """Warn if this training was started with other versions of the packages that it depends on."""
+    before = read_json(folder.path / "training.json", f"delete {folder.path} to train the agent again")["versions"]
+    if changed := [f"{name} {old}, not {now}" for name, now in versions().items() if (old := before.get(name)) != now]:
+        warn(
+            f"the training in {folder.path} was started with {', '.join(changed)}; its results may differ from here on"
         )
 
 
@@ -118,6 +131,8 @@ def _train(folder: TrainingFolder, steps: int) -> None:
         rows = [row for row in read_rungs(folder.rungs) if row["step"] <= model.num_timesteps]
         with Progress(steps, title, work=_work(settings, steps)) as progress:
             progress.skip(model.num_timesteps, _work(settings, model.num_timesteps))
+            if model.num_timesteps:
+                _say_other_versions(folder)
             progress.say(_plan(recipe, pace, model.num_timesteps, steps))
             while model.num_timesteps < steps and not stops:
                 start = time.process_time()  # of one thread: what else runs on the machine does not count

@@ -72,6 +72,8 @@ def _differences(metadata: JsonObject, source: Source, recipe: Recipe) -> Iterat
     provenance = minari_store.provenance(metadata)
     if provenance.level is not None and _level_name(provenance.level) != _level_name(source.level):
         yield f"level {provenance.level}, not {source.level}"
+    if provenance.contact_margin not in (None, recipe.contact_margin):
+        yield f"contact_margin {provenance.contact_margin}, not {recipe.contact_margin}"
     if provenance.seed not in (None, source.seed):
         yield f"seed {provenance.seed}, not {source.seed}"
     _, parts = parse_level(source.level)

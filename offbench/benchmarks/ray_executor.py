@@ -32,6 +32,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import write_bytes
 from offbench.common.processes import environment
 from offbench.data import minari_store
+from offbench.training.grouping import by_common_step
 from offbench.training.jobs import JobProgress, raise_first, train_job
 from offbench.training.registry import own_algorithm, use
 from offbench.training.source_code import own_modules
@@ -260,17 +261,23 @@ def _train_here(
 
     if _shared(token):
         os.environ["MINARI_DATASETS_PATH"] = datasets
-        return train_job(job, report)
+        return _train_groups(job, report)
     with _own_folder() as folder:
         for name in {spec.dataset for spec in job.specs}:
             write_folder(minari_store.path_of(name), ray.get(server.read.remote(f"{datasets}/{name}")))
         own = tuple(replace(spec, folder=folder / str(i)) for i, spec in enumerate(job.specs))
         for spec, local in zip(job.specs, own, strict=True):
             write_folder(local.folder, ray.get(server.read.remote(str(spec.folder))))
-        lines = train_job(replace(job, specs=own), report)
+        lines = _train_groups(replace(job, specs=own), report)
         for spec, local in zip(job.specs, own, strict=True):
             ray.get(server.write.remote(str(spec.folder), read_folder(local.folder)))
         return lines
+
+
+def _train_groups(job: Job, report: Callable[[int, str], None]) -> list[str]:
+    """Train the runs of a job that can resume together, group after group: a lost node may have written only some."""
+    groups = by_common_step(job.specs)
+    return [line for group in groups for line in train_job(replace(job, specs=tuple(group)), report)]
 
 
 def _record(source: Source, datasets: str, token: str, server: ActorHandle) -> tuple[bool, list[str]]:

@@ -57,14 +57,21 @@ class Loggers(contextlib.AbstractContextManager["Loggers"]):
         self.sinks: list[list[TensorBoard | WandB]] = [[] for _ in runs]
 
     def __enter__(self) -> Loggers:
-        for run, sinks in zip(self.runs, self.sinks, strict=True):
-            if self.show.tensorboard:
-                sinks.append(TensorBoard(run))
-            if self.show.wandb is not None:
-                sinks.append(WandB(run, self.show.wandb))
+        try:
+            for run, sinks in zip(self.runs, self.sinks, strict=True):
+                if self.show.tensorboard:
+                    sinks.append(TensorBoard(run))
+                if self.show.wandb is not None:
+                    sinks.append(WandB(run, self.show.wandb))
+        except BaseException:
+            self._close()  # those of the runs before
+            raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, _: object, __: TracebackType | None) -> None:
+        self._close()
+
+    def _close(self) -> None:
         for sink in (sink for sinks in self.sinks for sink in sinks):
             sink.close()
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+import json
 import os
 import re
 import shutil
@@ -26,6 +28,7 @@ from offbench.agents.sac import train
 from offbench.agents.training_folder import TrainingFolder
 from offbench.cli.main import main
 from offbench.common import checkpoints
+from offbench.common.errors import OffbenchError
 from offbench.envs.recipes import load_recipe
 
 
@@ -138,6 +141,34 @@ def test_an_environment_that_does_not_repeat_itself_resumes_at_the_segments_star
     assert checkpoints.steps(folder.path) == [1200, 800]
     with np.load(folder.transitions(1200)) as arrays:
         assert len(arrays["rewards"]) == 100
+
+
+def test_other_versions_are_named_when_a_training_resumes(
+    tiny: tuple[str, str], home: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = TrainingFolder(load_recipe(tiny[0]), 0, home / "training")
+    train(folder, 400)
+    path = folder.path / "training.json"
+    recorded = json.loads(path.read_text())
+    train(folder, 800)
+    assert "was started with" not in capfd.readouterr().err
+    recorded["versions"] |= {"mujoco": "3.1.0"}
+    path.write_text(json.dumps(recorded))
+    train(folder, 1200)
+    assert re.search(r"was started with mujoco 3\.1\.0, not [\d.]+; its results may differ", capfd.readouterr().err)
+
+
+def test_a_training_with_other_contact_margins_is_another_one(tiny: tuple[str, str], home: Path) -> None:
+    recipe = load_recipe(tiny[0])
+    folder = home / "training"
+    train(TrainingFolder(recipe, 0, folder), 400)
+    path = folder / "training.json"
+    recorded = json.loads(path.read_text())
+    assert recorded.pop("contact_margin") == "max"
+    path.write_text(json.dumps(recorded))  # as earlier versions wrote it
+    train(TrainingFolder(recipe, 0, folder), 400)
+    with pytest.raises(OffbenchError, match="holds another training, with contact_margin max, not sum"):
+        train(TrainingFolder(dataclasses.replace(recipe, contact_margin="sum"), 0, folder), 400)
 
 
 def test_a_folder_of_an_earlier_version_is_resumed_and_gets_the_same_ladder(tiny: tuple[str, str], home: Path) -> None:

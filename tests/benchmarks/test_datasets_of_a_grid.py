@@ -46,6 +46,14 @@ def test_a_grids_dataset_must_be_what_the_grid_would_record(
         check_recorded(source)
 
 
+def test_a_grids_dataset_must_have_the_recipes_contact_margins(medium: str, tiny: tuple[str, str], home: Path) -> None:
+    recipe = home / "other" / "tiny.toml"
+    recipe.parent.mkdir()
+    recipe.write_text('contact_margin = "sum"\n' + Path(tiny[0]).read_text())
+    with pytest.raises(OffbenchError, match="it has contact_margin max, not sum"):
+        check_recorded(Source(medium, str(recipe), "medium"))
+
+
 def test_a_shipped_grid_is_not_run_on_a_small_dataset_of_the_same_id(capsys: pytest.CaptureFixture[str]) -> None:
     """What a newcomer has after trying `collect` with a few steps."""
     offbench.collect("hopper", "random", steps=300, workers=1)

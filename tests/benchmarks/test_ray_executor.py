@@ -22,9 +22,10 @@ from offbench.benchmarks.grid import load_grid
 from offbench.benchmarks.plan import prepare
 from offbench.common.errors import OffbenchError
 from offbench.training.devices import Machine
+from offbench.training.jobs import train_job
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run, find_runs
-from offbench.training.spec import RunSpec
+from offbench.training.spec import Job, RunSpec
 from offbench.training.train import Training
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
@@ -108,6 +109,30 @@ def test_a_slice_begins_when_its_task_does(home: Path, medium: str, monkeypatch:
             task, words = executor._start(job, 0, token)
         assert task(*words) == (True, [])
     assert not ray_executor.unfinished(job)
+
+
+def test_runs_that_a_lost_node_left_far_apart_resume_on_their_own(home: Path, medium: str) -> None:
+    """It brought back the first run of a stack, but not the second."""
+    config: Any = load_algorithm("td3_bc").Config(hidden=(16, 16))
+
+    def specs(root: str, steps: int) -> tuple[RunSpec, ...]:
+        folders = [home / root / medium / "td3_bc" / "default" / f"seed-{seed}" for seed in range(2)]
+        return tuple(RunSpec("td3_bc", config, medium, i, steps, 100, 1, folder) for i, folder in enumerate(folders))
+
+    for chosen in (specs("whole", 600), specs("apart", 100), specs("apart", 400)[:1]):
+        (started,) = Training(list(chosen), Machine("cpu", 1)).jobs
+        train_job(started, lambda *_: None)
+    job = Job(specs("apart", 600), "cpu")
+    begun: list[int] = []
+    with ray_executor._token(home) as token:
+        arguments = (str(home / "minari"), token, SimpleNamespace(), lambda step, _: begun.append(step))
+        assert ray_executor._train_here(job, *arguments) == []
+    assert begun[0] == 400
+    assert 100 in begun
+    assert 0 not in begun
+    for one, other in zip(specs("whole", 600), specs("apart", 600), strict=True):
+        assert one.run.evaluations_path.read_bytes() == other.run.evaluations_path.read_bytes()
+        assert one.run.policy_path.read_bytes() == other.run.policy_path.read_bytes()
 
 
 def test_nodes_that_share_no_disk_fetch_and_bring_back(

@@ -343,6 +343,11 @@ def test_a_ladder_of_another_environment_is_refused(tiny: tuple[str, str], home:
     (home / "tiny.toml").write_text(TINY_RECIPE + "\n[env_kwargs]\nframe_skip = 4\n")
     with pytest.raises(offbench.OffbenchError, match=r"the recipe is of InvertedPendulum-v5 \{'frame_skip': 4\}"):
         offbench.collect("./tiny.toml", behaviour_dir=tiny[1])
+    (home / "tiny.toml").write_text('contact_margin = "sum"\n' + TINY_RECIPE)
+    with pytest.raises(
+        offbench.OffbenchError, match=r"the recipe is of InvertedPendulum-v5 .*with contact_margin sum"
+    ):
+        offbench.collect("./tiny.toml", behaviour_dir=tiny[1])
 
 
 def test_a_share_of_nothing(tiny: tuple[str, str]) -> None:

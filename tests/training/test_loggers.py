@@ -176,6 +176,26 @@ def test_wandbs_refusal_is_one_line(home: Path, fake_wandb: list[FakeRun], monke
         show(run, 5000)
 
 
+def test_a_refusal_at_the_second_run_closes_the_first(
+    fake_wandb: list[FakeRun], home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = sys.modules["wandb"].init
+
+    def only_once(**arguments: Any) -> FakeRun:
+        if fake_wandb:
+            raise RuntimeError("too many runs")
+        return opened(**arguments)
+
+    monkeypatch.setattr(sys.modules["wandb"], "init", only_once)
+    runs = [made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", seed, 50) for seed in range(2)]
+    with (
+        pytest.raises(offbench.OffbenchError, match="too many runs"),
+        Loggers(runs, Destinations(wandb="project")),
+    ):
+        pass
+    assert fake_wandb[0].finished
+
+
 @pytest.mark.parametrize("name", ["tensorboard", "wandb"])
 def test_a_run_whose_folder_of_events_is_a_link(name: str, home: Path, fake_wandb: list[FakeRun]) -> None:
     """In a run that was handed over it may lead anywhere."""
