@@ -34,7 +34,17 @@ from offbench.common.terminal import inform, warn
 from offbench.data import minari_store, minari_writer
 from offbench.data.d4rl_file import NUMBERS, SEEDS, Source, read_source
 from offbench.data.minari_reader import flags
-from offbench.envs.environments import Space, box, make_env, parse_spec, spaces_of, time_limit, untrusted_env
+from offbench.data.recorded_env import evaluation_spec
+from offbench.envs.environments import (
+    Space,
+    box,
+    make_env,
+    parse_spec,
+    same_environment,
+    spaces_of,
+    time_limit,
+    untrusted_env,
+)
 from offbench.envs.margin_rule import ADDED, MARGIN, without_margin
 from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference, load_recipe, names
 from offbench.rollouts.rollouts import Episode
@@ -299,14 +309,19 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
     about, complete = source.about, "next_observations" in source.columns
     fields = {key: about[key] for key in (*NUMBERS, "requirements") if key in about}
     fields |= {key: set(about[key]) for key in ("author", "author_email") if key in about}
-    constants = d4rl_reference(origin.recorded)
     ours: JsonObject = {
         "format": "offbench-import-1",
         "timeouts": "kept" if complete else "dropped",
         "final_observations": "kept" if complete else "repeated",
-        "d4rl": constants,
+        "d4rl": d4rl_reference(origin.recorded),
     }
     ours |= about.get(minari_store.KEY, {})
+    before = evaluation_spec(about)
+    if origin.recipe and origin.evaluated and before and not same_environment(before, origin.evaluated):
+        warn(f"--env names another environment than {source.path} does, so its reference scores are left out")
+        fields = {key: value for key, value in fields.items() if key not in ("ref_min_score", "ref_max_score")}
+        ours = {key: value for key, value in ours.items() if key not in ("references", MARGIN)}
+        ours["d4rl"] = d4rl_reference(without_margin(origin.evaluated)[0])
     ours["imported"] = {
         "file": source.path.name,
         "sha256": sha256_of(source.path),

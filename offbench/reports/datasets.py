@@ -11,6 +11,7 @@ from offbench.analysis.results import Results, Task
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, read_json
 from offbench.common.tables import Cell, Table
+from offbench.common.terminal import warn
 from offbench.data import minari_store, transitions
 from offbench.reports.markup import Markup, join, tag
 from offbench.reports.page import table
@@ -45,7 +46,9 @@ def _sizes(task: Task) -> list[Cell]:
         if recorded not in (None, task.content):
             return [NONE] * 3  # recorded again since: not worth a conversion
         data = transitions.load(task.dataset)
-    except (OffbenchError, OSError):  # OSError: a name that no file system takes
+    except (OffbenchError, OSError) as error:  # OSError: a name that no file system takes
+        if task.dataset in minari_store.local_ids():
+            warn(f"the report has no sizes of {task.dataset}: {error}")
         return [NONE] * 3
     if data.content != task.content:
         return [NONE] * 3

@@ -209,6 +209,23 @@ def test_a_dataset_comes_back_the_same(level: str, tiny: tuple[str, str], home: 
     assert any("played again" in line for line in report.checked)
 
 
+def test_the_references_of_another_environment_are_left_out(
+    medium: str, tiny: tuple[str, str], home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    export(medium, "out.hdf5")
+    recipe = home / "mine.toml"
+    recipe.write_text(Path(tiny[0]).read_text())
+    import_d4rl("out.hdf5", "same-v0", env=str(recipe))
+    assert minari_store.read_metadata("same-v0")["ref_max_score"] > 0
+    recipe.write_text('contact_margin = "sum"\n' + Path(tiny[0]).read_text())
+    import_d4rl("out.hdf5", "other-v0", env=str(recipe))
+    assert "--env names another environment than out.hdf5 does" in capsys.readouterr().err
+    metadata = minari_store.read_metadata("other-v0")
+    assert not {"ref_min_score", "ref_max_score"} & metadata.keys()
+    assert minari_store.provenance(metadata).contact_margin == "sum"
+    assert not minari_store.provenance(metadata).references
+
+
 def test_npz_holds_what_offbench_trains_on(medium: str, home: Path) -> None:
     main(["export", medium, "--out", "arrays.npz", "--format", "npz"])
     with np.load(home / "arrays.npz", allow_pickle=False) as file:

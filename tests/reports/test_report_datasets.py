@@ -35,6 +35,15 @@ def test_the_datasets_are_those_of_the_runs(medium: str, home: Path) -> None:
     assert found["000000000000"] == ["my-data-v0", "Hopper-v5", "-", "-", "-", scale, "000000000000"]
 
 
+def test_a_damaged_dataset_is_named(
+    medium: str, home: Path, capsys: pytest.CaptureFixture[str], undrawn: None
+) -> None:
+    made_run(home / "runs", medium, "td3_bc", "default", 0, 50)
+    next(home.glob("minari/*/data/metadata.json")).write_text("{")
+    offbench.report(home / "runs", home / "out")
+    assert f"the report has no sizes of {medium}: " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("torn", [False, True])
 def test_datasets_of_one_environment_on_two_scales_are_named(home: Path, torn: bool) -> None:
     references = ([0.0, 50.0 if torn else 100.0], [-10.0, 190.0])
