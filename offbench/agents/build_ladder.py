@@ -298,6 +298,8 @@ def _write(out: Path, evaluator: RungEvaluator, roles: dict[int, str], info: Jso
         info["medium_replay"] = save_replay(
             temporary / "medium-replay.hdf5", replay_episodes(folder, info["levels"]["medium"])
         )
+        if folder.recipe.replay_envs:
+            info["medium_replay"] |= {"envs": folder.recipe.replay_envs}
         write_json(temporary / "ladder.json", info)
         old = replaced_by(out)
         delete(old)

@@ -52,10 +52,11 @@ class Rung:
 
 @dataclass(frozen=True)
 class Replay:
-    """What a ladder.json says of medium-replay.hdf5."""
+    """What a ladder.json says of medium-replay.hdf5. `envs`: the recipe's `replay_envs`."""
 
     transitions: int
     sha256: str
+    envs: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

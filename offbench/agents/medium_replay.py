@@ -1,4 +1,7 @@
-"""medium-replay: every transition of a behaviour agent's training up to the medium rung, as episodes.
+"""medium-replay: the transitions of a behaviour agent's training up to the medium rung, as episodes.
+
+Where all of them are too many to ship, the recipe's `replay_envs` keeps those of the first of the environments that
+were stepped together.
 
 segment files [steps, envs, ...]  ->  per segment, per environment stream: episodes
 HDF5: observations [N + E, obs] (T + 1 rows an episode, end to end)   actions [N, act] in [-1, 1]
@@ -40,14 +43,17 @@ class Piece(NamedTuple):
 
 
 def replay_episodes(folder: TrainingFolder, until: int) -> Iterator[Piece]:
-    """Yield the episodes of a training's first `until` steps, segment by segment, stream by stream."""
+    """Yield the episodes of a training's first `until` steps, segment by segment, stream by stream.
+
+    Of the streams, one for each environment, only the recipe's `replay_envs` are kept.
+    """
     segment = folder.recipe.sac.segment
     for start in range(0, until, segment):
         arrays = folder.read_transitions(start + segment)
         streams = arrays["rewards"].shape[1]
         rows = (until - start) // streams  # all of them, except in the segment that `until` lies in
         arrays = {name: array[:rows] for name, array in arrays.items()}
-        for stream in range(streams):
+        for stream in range(min(streams, folder.recipe.replay_envs or streams)):
             yield from _cut({name: array[:, stream] for name, array in arrays.items()}, stream)
 
 

@@ -278,7 +278,11 @@ class _Recording:
             return f"the policy {self.given.source}"
         if rung is None:
             fraction = self.ladder.fraction(self.ladder.role("medium"))
-            return f"the replay of SAC's training up to its medium policy, at {fraction:.2f} of the expert's return"
+            info, which = self.ladder.info, ""
+            if info.medium_replay.envs:
+                which = f" ({info.medium_replay.envs} of its {info.sac['envs']} environments)"
+            until = f"up to its medium policy, at {fraction:.2f} of the expert's return"
+            return f"the replay of SAC's training{which} {until}"
         fraction = self.ladder.fraction(rung)
         return f"SAC's policy of training step {rung.step}, at {fraction:.2f} of the expert's return"
 

@@ -72,6 +72,9 @@ class Recipe:
     contact_margin: str = setting(
         EARLIER, "contact margins of MuJoCo before 3.5 (max) or since (sum)", choices=(EARLIER, ADDED)
     )
+    replay_envs: int | None = setting(
+        None, "environments of SAC's training that medium-replay keeps (default: all)", low=1
+    )
     env_kwargs: tuple[tuple[str, object], ...] = ()
     sac: SACSettings = dataclasses.field(default_factory=SACSettings)
     measure: Measurement = dataclasses.field(default_factory=Measurement)
@@ -84,8 +87,9 @@ class Recipe:
     def sha256(self) -> str:
         """Return a hash over everything the recipe says (not over its layout or comments)."""
         values = {k: v for k, v in dataclasses.asdict(self).items() if k != "folder"}
-        if self.contact_margin == EARLIER:
-            del values["contact_margin"]  # the only rule before it was a setting, so that earlier hashes stay valid
+        for name, default in (("contact_margin", EARLIER), ("replay_envs", None)):
+            if values[name] == default:
+                del values[name]  # settings of later versions: earlier hashes stay valid
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import warnings
 from pathlib import Path
 from typing import Any
@@ -135,6 +136,21 @@ def test_medium_replay_is_every_transition_of_training(tiny: tuple[str, str]) ->
     replayed = np.concatenate([e.actions for e in episodes])
     np.testing.assert_allclose(replayed, 3 * np.concatenate(actions), atol=1e-6)
     assert sum(bool(e.terminations[-1]) for e in episodes) == terminated
+
+
+def test_medium_replay_of_some_environments(tiny: tuple[str, str], home: Path) -> None:
+    """Where all transitions are too many to ship: whole episodes of the first of the four environments."""
+    shutil.copytree(Path(tiny[1]), home / "behaviour", ignore=shutil.ignore_patterns("ladder"))
+    (home / "tiny.toml").write_text("replay_envs = 1\n" + Path(tiny[0]).read_text())
+    ladder = offbench.behaviour("./tiny.toml", behaviour_dir=home / "behaviour", workers=1)
+    name = offbench.collect("./tiny.toml", "medium-replay", behaviour_dir=home / "behaviour")
+    rewards = [
+        np.load(home / "behaviour" / "tiny" / "seed-0" / "transitions" / f"{end:09d}.npz")["rewards"][:, 0]
+        for end in range(400, ladder.info.levels["medium"] + 1, 400)
+    ]
+    dataset = minari.load_dataset(name)
+    np.testing.assert_array_equal(np.concatenate([e.rewards for e in dataset]), np.concatenate(rewards))
+    assert "(1 of its 4 environments)" in dataset.storage.metadata["description"]
 
 
 def test_recorded_episodes_replay_from_their_seeds(medium: str) -> None:
