@@ -143,11 +143,12 @@ class Plan:
         rate = measure(spec, env_spec, machine.device)
         each = _cost(spec, rate, play, env_spec)
         self.update_seconds[spec.algorithm] = each / spec.steps
-        cost = runs * each / machine.processes
+        left = sum(1 - spec.run.newest_checkpoint() / spec.steps for spec in specs)  # of a whole run each
+        cost = left * each / machine.processes
         self._seconds += cost
         self._disk += 2 * rate.bytes_per_run * runs
         if machine.device == "cpu":
-            self._products += runs * spec.steps * operations(spec, env_spec)
+            self._products += left * spec.steps * operations(spec, env_spec)
         return (
             f"  {_name(spec):<{name_width}}{runs:>4} runs x {spec.steps:>{width},} updates "
             f"at {rate.updates:>5,.0f}/s: {duration(cost)}"

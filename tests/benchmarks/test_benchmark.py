@@ -90,6 +90,20 @@ def test_the_papers_grid_is_its_table() -> None:
 
 
 @pytest.mark.usefixtures("unmeasured")
+def test_a_plan_does_not_charge_the_updates_that_are_done(grid: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("offbench.benchmarks.plan.step_seconds", lambda _: 1e-4)
+    seconds = []
+    for part in (0, 2):
+        for spec in (spec for specs in prepare(grid, workers=1).variants for spec in specs if part):
+            spec.folder.mkdir(parents=True)
+            (spec.folder / f"checkpoint-{spec.steps // part:09d}.safetensors").touch()
+        plan = Plan(prepare(grid, workers=1))
+        assert list(plan)
+        seconds.append(plan._seconds)
+    assert seconds[1] == pytest.approx(seconds[0] / 2)
+
+
+@pytest.mark.usefixtures("unmeasured")
 @pytest.mark.parametrize("name", shipped_grids())
 def test_shipped_grids_are_sound_and_their_plan_counts_what_is_left(name: str) -> None:
     bench = prepare(name, workers=2)
