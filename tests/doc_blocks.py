@@ -40,6 +40,7 @@ REASONS = (
     "takes hours",
     "needs other MuJoCo versions",
     "needs d3rlpy's environment and the runs above",
+    "reads the run files of a clone",
     "needs a renderer",
     "needs D4RL's files",
     "another library's code",

@@ -18,7 +18,7 @@ from offbench.algorithm import Algorithm, Batch, Logs, Noise, NoiseSpec, Target,
 
 @dataclass(frozen=True)
 class Config:
-    temperature: float = setting(1.0, "how little better actions are preferred", above=0)
+    temperature: float = setting(1.0, "an action's weight is exp(advantage / temperature)", above=0)
     discount: float = setting(0.99, "discount", low=0, high=1)
     tau: float = setting(0.005, "Polyak rate of the critics' target", above=0, high=1)
     learning_rate: float = setting(3e-4, "Adam's learning rate", above=0)

@@ -147,7 +147,7 @@ def methods() -> list[str]:
 def trust(parser: Parser) -> None:
     """Add --trust, which `main` takes."""
     parser.add_argument(
-        "--trust", action="store_true", help="import and run the environment that a file names, whatever its code"
+        "--trust", action="store_true", help="trust the files: import and run any environment that they name"
     )
 
 

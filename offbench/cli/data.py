@@ -15,7 +15,9 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `collect`."""
     _env(parser, "a shipped environment (see `offbench list`) or a recipe file")
     level = parser.add_argument(
-        "--level", default="medium", help="a level, or a fraction such as 0.6 (default: medium)"
+        "--level",
+        default="medium",
+        help="a level, or a fraction of the expert's normalized return such as 0.6 (default: medium)",
     )
     completed(level, levels)
     parser.add_argument("--mix", metavar="LEVEL:SHARE,...", help="a mix of levels, e.g. random:0.5,expert:0.5")
@@ -25,13 +27,17 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
         help="record this policy instead of a level: agent.zip (SB3), a run, a policy file, or module:function",
     )
     parser.add_argument("--name", help="with --policy: the level in the dataset's id (default: the policy's name)")
-    parser.add_argument("--steps", type=whole, help="transitions (default: the recipe's, 1,000,000)")
+    parser.add_argument("--steps", type=whole, help="transitions (default: the whole level, usually 1,000,000)")
     parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--workers", type=whole, help="recording processes (default: one per core)")
     parser.add_argument("--id", dest="dataset_id", metavar="ID", help="the dataset's id (default: <env>-<level>-v0)")
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset with the same id")
-    parser.add_argument("--retrain", action="store_true", help="use an agent trained here instead of the shipped one")
-    parser.add_argument("--accept", action="store_true", help="take the nearest policy, however far from the level")
+    parser.add_argument(
+        "--retrain", action="store_true", help="train a behaviour agent instead of using the shipped one"
+    )
+    parser.add_argument(
+        "--accept", action="store_true", help="record the nearest policy, however far it is from the level"
+    )
     _behaviour_dir(parser)
 
     def run(**arguments: Any) -> None:
@@ -48,7 +54,7 @@ def behaviour_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--seed", type=natural, default=0, help="seed of the training (default: 0)")
     parser.add_argument("--steps", type=whole, help="environment steps (default: the recipe's)")
     parser.add_argument("--workers", type=whole, help="processes that evaluate rungs (default: one per core)")
-    parser.add_argument("--out", metavar="DIR", help="folder of the ladder (default: in the training's folder)")
+    parser.add_argument("--out", metavar="DIR", help="folder of the ladder (default: below --behaviour-dir)")
     _behaviour_dir(parser)
 
     def run(**arguments: Any) -> None:
@@ -76,7 +82,7 @@ def _dataset(parser: Parser) -> None:
 
 def _behaviour_dir(parser: Parser) -> None:
     parser.add_argument(
-        "--behaviour-dir", default="behaviour", metavar="DIR", help="folder of trainings (default: behaviour)"
+        "--behaviour-dir", default="behaviour", metavar="DIR", help="folder of behaviour agents (default: behaviour)"
     )
 
 
@@ -124,7 +130,7 @@ def card_arguments(parser: Parser, _: list[str]) -> None:
     about = parser.add_argument(
         "about",
         metavar="ENV_OR_ID",
-        help="a shipped environment or a recipe file, its five levels recorded; with --huggingface a dataset",
+        help="a shipped environment or a recipe file whose five levels are recorded; with --huggingface a dataset",
     )
     completed(about, lambda: [*recipes(), *local_datasets()])
     parser.add_argument(
@@ -175,7 +181,7 @@ def import_arguments(parser: Parser, _: list[str]) -> None:
         "--id", dest="dataset_id", required=True, metavar="ID", help="the Minari id, e.g. d4rl-hopper-medium-v2"
     )
     env = parser.add_argument(
-        "--env", metavar="RECIPE", help="environment of the file, and for evaluation (default: by its name)"
+        "--env", metavar="RECIPE", help="environment of the file, also for evaluation (default: by the file's name)"
     )
     completed(env, recipes)
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset with the same id")
@@ -200,7 +206,9 @@ def export_arguments(parser: Parser, _: list[str]) -> None:
         help="d4rl or npz (default: by the file's ending)",
     )
     parser.add_argument(
-        "--drop-timeouts", action="store_true", help="npz: leave out the steps that D4RL's qlearning_dataset drops"
+        "--drop-timeouts",
+        action="store_true",
+        help="npz: drop the steps at timeouts, as D4RL's qlearning_dataset does",
     )
 
     parser.set_defaults(run=lambda **options: print(f"saved {offbench.export(**options)}"))

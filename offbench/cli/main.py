@@ -35,7 +35,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
             data.list_arguments,
             ["list", "list runs", "list datasets --json"],
         ),
-        "show": Command("show what is in a dataset", data.show_arguments, ["show hopper-medium-v0"]),
+        "show": Command("print the contents of a dataset", data.show_arguments, ["show hopper-medium-v0"]),
         "verify": Command(
             "check a dataset's arrays and metadata, and replay episodes",
             data.verify_arguments,
@@ -52,7 +52,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
             ["export hopper-medium-v0 --out hopper-medium.hdf5"],
         ),
         "card": Command(
-            "write an environment's card, or a dataset's for Hugging Face",
+            "write an environment's dataset card, or a card for Hugging Face",
             data.card_arguments,
             ["card hopper", "card hopper-medium-v0 --huggingface"],
         ),
@@ -84,7 +84,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
             ["normalize", "normalize --env hopper 1234.5 987"],
         ),
         "report": Command(
-            "write all runs as a page with tables and figures",
+            "write a page with tables and figures of all runs",
             results.report_arguments,
             ["report", "report --datasets 'hopper-*' --methods td3_bc 'bdb (adaptive)'"],
         ),

@@ -20,7 +20,9 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
     from offbench.analysis.normalize import FORMATS
 
     parser.add_argument("returns", nargs="*", type=number, metavar="RETURN", help="returns to score, with --env")
-    completed(parser.add_argument("--env", help="environment of the returns"), recipes)
+    completed(
+        parser.add_argument("--env", metavar="ENV", help="shipped environment or recipe file of the returns"), recipes
+    )
     parser.add_argument("--runs", default="runs", metavar="DIR", help=RUNS_HELP)
     parser.add_argument(
         "--format",
@@ -69,7 +71,7 @@ def report_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--out", default="report", metavar="DIR", help="folder of the report (default: report)")
     parser.add_argument("--title", help="title of the page (default: Offline RL benchmark)")
     datasets = parser.add_argument(
-        "--datasets", nargs="+", metavar="ID", help="only these datasets; patterns such as 'hopper-*' are understood"
+        "--datasets", nargs="+", metavar="ID", help="only these datasets: ids, or patterns such as 'hopper-*'"
     )
     completed(datasets, local_datasets)
     only = parser.add_argument("--methods", nargs="+", metavar="NAME", help="only these methods, as tables name them")
@@ -82,7 +84,10 @@ def compare_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `compare`."""
     completed(parser.add_argument("a", metavar="A", help="a method as tables name it, e.g. td3_bc"), methods)
     completed(
-        parser.add_argument("b", metavar="B", help="the other one, e.g. 'bdb (beta=0.5)' or bdb/beta=0.5"), methods
+        parser.add_argument(
+            "b", metavar="B", help="the method to compare with, e.g. 'bdb (beta=0.5)' or bdb/beta=0.5"
+        ),
+        methods,
     )
     parser.add_argument("--runs", default="runs", metavar="DIR", help=RUNS_HELP)
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -102,19 +107,27 @@ def compare_arguments(parser: Parser, _: list[str]) -> None:
 def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `evaluate`."""
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_POLICY", help="run directories or policy files")
-    completed(parser.add_argument("--env", help="environment, instead of the policy's own"), recipes)
+    completed(parser.add_argument("--env", help="environment to use instead of the policy's own"), recipes)
     parser.add_argument("--episodes", type=whole, default=10, help="number of episodes (default: 10)")
     parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mode")
     parser.add_argument(
-        "--similarity", action="store_true", help="compute a run's similar score on its dataset instead"
+        "--similarity", action="store_true", help="compute the similar score of runs on their datasets instead"
     )
     parser.add_argument(
         "--algorithm", metavar="FILE", help="similar score: FILE.py:CLASS of an algorithm that is not installed"
     )
-    parser.add_argument("--tolerance", type=number, default=0.05, help="similar score: share of |Q| (default: 0.05)")
     parser.add_argument(
-        "--action-tolerance", type=number, default=0.1, help="similar score by action: distance (default: 0.1)"
+        "--tolerance",
+        type=number,
+        default=0.05,
+        help="similar score: largest difference of Q, as a share of |Q1(s, a)| (default: 0.05)",
+    )
+    parser.add_argument(
+        "--action-tolerance",
+        type=number,
+        default=0.1,
+        help="similar score by action: largest root mean square distance (default: 0.1)",
     )
     parser.add_argument("--workers", type=whole, help="processes (default: one per core)")
     trust(parser)
@@ -149,9 +162,9 @@ def video_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `video`."""
     parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run, a policy file, or ENV:LEVEL (hopper:medium)")
     parser.add_argument("--out", default="video.gif", metavar="FILE", help=".gif or .mp4 (default: video.gif)")
-    completed(parser.add_argument("--env", help="environment, instead of the policy's own"), recipes)
+    completed(parser.add_argument("--env", help="environment to use instead of the policy's own"), recipes)
     parser.add_argument("--episodes", type=whole, default=1, help="number of episodes (default: 1)")
-    parser.add_argument("--seconds", type=number, help="longest duration (default: whole episodes)")
+    parser.add_argument("--seconds", type=number, help="maximum duration (default: whole episodes)")
     parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--fps", type=whole, default=25, help="frames per second (default: 25)")
     parser.add_argument("--size", type=whole, default=480, help="longer side in pixels (default: 480)")

@@ -22,21 +22,27 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     names = ", ".join(algorithm_names())
     argument = parser.add_argument("algorithm", metavar="ALGO", help=f"one of {names}, or ./FILE.py:CLASS")
     completed(argument, algorithm_names)
-    dataset = parser.add_argument("--dataset", required=True, nargs="+", metavar="ID", help="local Minari datasets")
+    dataset = parser.add_argument(
+        "--dataset", required=True, nargs="+", metavar="ID", help="ids of local Minari datasets"
+    )
     completed(dataset, local_datasets)
     _environment(parser)
+    parser.add_argument("--download", action="store_true", help="first download missing datasets from Minari's server")
     parser.add_argument(
-        "--download", action="store_true", help="download datasets that are not here from Minari's server first"
-    )
-    parser.add_argument(
-        "--seeds", type=seed_list, default=[0], metavar="LIST", help="seeds: 3, 0,1,2 or 0:5 (0 to 4) (default: 0)"
+        "--seeds",
+        type=seed_list,
+        default=[0],
+        metavar="LIST",
+        help="seeds to run: 3, 0,1,2 or 0:5 (0 to 4) (default: 0)",
     )
     parser.add_argument("--steps", type=whole, default=1_000_000, help="updates (default: 1,000,000)")
     parser.add_argument("--eval-every", type=whole, default=5_000, help="updates between evaluations (default: 5,000)")
     parser.add_argument("--eval-episodes", type=whole, default=10, help="episodes per evaluation (default: 10)")
     _machine(parser)
-    parser.add_argument("--fresh", action="store_true", help="delete what the run folders hold and train again")
-    parser.add_argument("--tensorboard", action="store_true", help="write event files into each run's folder")
+    parser.add_argument("--fresh", action="store_true", help="delete the runs of this command and train them again")
+    parser.add_argument(
+        "--tensorboard", action="store_true", help="write TensorBoard event files into each run's folder"
+    )
     parser.add_argument("--wandb", metavar="PROJECT", help="log to a Weights & Biases project")
     if algorithm is None:
         parser.epilog = f"`offbench train ALGO --help` shows an algorithm's own settings.\n\n{parser.epilog}"
@@ -96,7 +102,11 @@ def _machine(parser: Parser) -> None:
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
     parser.add_argument("--workers", type=whole, help="processes for training and evaluation (default: one per core)")
     parser.add_argument(
-        "--stack", type=auto, default="auto", metavar="N", help="most runs that train as one program: auto or N"
+        "--stack",
+        type=auto,
+        default="auto",
+        metavar="N",
+        help="maximum number of runs trained as one program, or auto (default: auto)",
     )
     parser.add_argument(
         "--precision",
@@ -115,9 +125,11 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
     grid = parser.add_argument("grid", metavar="GRID", help=f"{', '.join(shipped_grids())}, or a grid file")
     completed(grid, shipped_grids)
     _environment(parser)
-    parser.add_argument("--plan", action="store_true", help="print the runs, their cost and disk space, and exit")
-    parser.add_argument("--budget", metavar="TIME", help="stop after this time with checkpoints: 90s, 9m or 2h")
-    parser.add_argument("--shard", type=share, default=(0, 1), metavar="I/N", help="run share I of N, counted from 0")
+    parser.add_argument("--plan", action="store_true", help="print the runs, their time and disk space, and exit")
+    parser.add_argument("--budget", metavar="TIME", help="write checkpoints and stop after this time: 90s, 9m or 2h")
+    parser.add_argument(
+        "--shard", type=share, default=(0, 1), metavar="I/N", help="train share I of N, counted from 0"
+    )
     parser.add_argument(
         "--executor",
         choices=("local", "ray"),

@@ -52,22 +52,24 @@ def train(
     """Train one algorithm on one or more datasets, or resume the runs from their newest checkpoints.
 
     Args:
-        algorithm: a registered name (td3_bc, bdb, cql, or a third party's), a file `./my_algo.py:ReBRAC`, or a class.
+        algorithm: a registered name (td3_bc, bdb, cql, or that of an installed package), a file
+            `./my_algo.py:ReBRAC`, or a class.
         dataset: one id of a local Minari dataset, or several.
         env: the recipe's name or file of the environment to evaluate in, instead of the one that the dataset names.
-        download: fetch datasets that are not here from Minari's server first.
+        download: first download missing datasets from Minari's server.
         seeds: one seed or several; a run's random numbers depend only on its own seed.
         steps: updates of each run.
         eval_every, eval_episodes: updates between evaluations, and episodes of the deterministic policy in each.
         device: auto, cpu, cuda or cuda:N.
         workers: processes for training and evaluation (default: one per core).
-        stack: the most runs that train as one program; "auto" follows the device's memory.
+        stack: the maximum number of runs trained as one program; "auto" is what fits the memory of a GPU, or 8 on a
+            CPU.
         precision: of matrix products: float32, tf32 (GPUs) or bfloat16 (GPUs, and processors that multiply it
             natively). Weights, Adam, targets, losses and normalization are float32 in each.
         runs: the folder of all run folders.
         tensorboard: write TensorBoard event files into each run's folder `tensorboard`.
-        wandb: a Weights & Biases project to show the runs in.
-        fresh: delete what the runs' folders hold and train anew, where the algorithm's code has changed since.
+        wandb: a Weights & Biases project to log the runs to.
+        fresh: delete the contents of the runs' folders first, for example if the algorithm's code has changed.
         command: what the user typed, for the run's config.json.
         settings: the algorithm's own (`offbench train bdb --help`); each also takes a list of values, e.g.
             `beta=[0.25, 0.5, "adaptive"]`, or `hidden=[(64, 64), (256, 256)]`.

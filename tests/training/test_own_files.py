@@ -75,7 +75,7 @@ def test_a_file_trains_resumes_and_reports(home: Path, capsys: pytest.CaptureFix
     assert "AWAC" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         main(["train", "./awac.py", "--help"])
-    assert "how little better actions are preferred" in capsys.readouterr().out
+    assert "exp(advantage / temperature)" in capsys.readouterr().out
 
 
 @pytest.mark.slow
