@@ -71,5 +71,9 @@ def moved_flag(algorithm: str, words: list[str]) -> str | None:
     """Return the first flag that bdb had in earlier versions and bdb_plus has now; None if there is none."""
     from offbench.training.registry import MOVED
 
-    moved = {f"--{name.replace('_', '-')}" for name in (MOVED if algorithm == "bdb" else {})}
+    if algorithm != "bdb":
+        return None
+    if {"learned", "--beta=learned"} & set(words):
+        return "--beta learned"
+    moved = {f"--{name.replace('_', '-')}" for name in MOVED}
     return next((flag for flag in (word.partition("=")[0] for word in words) if flag in moved), None)

@@ -61,6 +61,16 @@ def test_earlier_runs_are_reported(home: Path) -> None:
     assert len(find_runs(home / "runs")) == len(SETTINGS)
 
 
+@pytest.mark.parametrize("beta", [["--beta", "learned"], ["--beta=learned"]])
+def test_a_learned_beta_trains_bdb_plus(beta: list[str], home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(EARLIER / "minari", home / "minari")
+    words = "train bdb --dataset pendulum-small-v0 --steps 4 --eval-every 2 --eval-episodes 1 --hidden 8,8 --workers 1"
+    main([*words.split(), *beta])
+    assert "--beta learned is an option of bdb_plus, no longer of bdb" in capsys.readouterr().err
+    (run,) = find_runs(home / "runs")
+    assert (run.config().algorithm, run.config().settings["beta"]) == ("bdb_plus", "learned")
+
+
 def test_options_that_bdb_had_train_bdb_plus(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(EARLIER / "minari", home / "minari")
     words = "train bdb --dataset pendulum-small-v0 --steps 4 --eval-every 2 --eval-episodes 1 --hidden 8,8 --workers 1"
