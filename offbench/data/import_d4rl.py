@@ -316,12 +316,6 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
         "d4rl": d4rl_reference(origin.recorded),
     }
     ours |= about.get(minari_store.KEY, {})
-    before = evaluation_spec(about)
-    if origin.recipe and origin.evaluated and before and not same_environment(before, origin.evaluated):
-        warn(f"--env names another environment than {source.path} does, so its reference scores are left out")
-        fields = {key: value for key, value in fields.items() if key not in ("ref_min_score", "ref_max_score")}
-        ours = {key: value for key, value in ours.items() if key not in ("references", MARGIN)}
-        ours["d4rl"] = d4rl_reference(without_margin(origin.evaluated)[0])
     ours["imported"] = {
         "file": source.path.name,
         "sha256": sha256_of(source.path),
@@ -337,9 +331,17 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
     }
     if origin.evaluated:
         metadata["eval_env_spec"], rule = without_margin(origin.evaluated)
-        if origin.recipe and rule == ADDED:
-            ours[MARGIN] = rule
     minari_store.check_metadata(metadata, f"{source.path}: its offbench attribute", "export the dataset again")
+    if origin.evaluated and origin.recipe:
+        before = evaluation_spec(about)
+        if before and not same_environment(before, origin.evaluated):
+            warn(f"--env names another environment than {source.path} does, so its reference scores are left out")
+            metadata = {key: value for key, value in metadata.items() if key not in ("ref_min_score", "ref_max_score")}
+            ours = {key: value for key, value in ours.items() if key not in ("references", MARGIN)}
+            ours["d4rl"] = d4rl_reference(metadata["eval_env_spec"])
+        if rule == ADDED:
+            ours[MARGIN] = rule
+        metadata[minari_store.KEY] = ours
     return metadata, _spaces(source, origin.recipe)
 
 

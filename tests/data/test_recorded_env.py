@@ -141,7 +141,7 @@ def test_a_recipe_may_ask_for_the_rule_of_later_versions(
 ) -> None:
     recipe = home / "added.toml"
     recipe.write_text('contact_margin = "sum"\n' + Path(tiny[0]).read_text())
-    offbench.collect(str(recipe), "random", steps=50, behaviour_dir=tiny[1], workers=1, dataset_id="added-v0")
+    offbench.collect(str(recipe), "random", steps=50, workers=1, dataset_id="added-v0")
     metadata = minari_store.read_metadata("added-v0")
     for key in ("env_spec", "eval_env_spec"):
         assert without_margin(metadata[key]) == (metadata[key], EARLIER)  # Gymnasium's own, nothing added

@@ -250,7 +250,7 @@ def test_training_survives_kill_9_at_any_moment(
         assert run.config().dataset_sha256 == right.config().dataset_sha256
 
     trials(warm, words, "train", home, monkeypatch, prepare, look, record_property)
-    assert KILLS["train"] < 50 or {0, 40, 80} <= set(last)  # killed early and late
+    assert KILLS["train"] < 50 or (0 in last and {40, 80, 120} & set(last))  # killed early and late
 
 
 def sound(run: Run) -> int:
