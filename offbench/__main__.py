@@ -1,4 +1,4 @@
-"""`python -m offbench` is `offbench`."""
+"""Run the command line as `python -m offbench`."""
 
 import sys
 
@@ -7,7 +7,7 @@ def main() -> None:
     """Run one command; see offbench.cli.main."""
     try:
         from offbench.cli.main import main as run
-    except KeyboardInterrupt:  # while it is imported
+    except KeyboardInterrupt:  # Ctrl-C during the import
         sys.exit(130)
     run()
 

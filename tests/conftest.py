@@ -72,7 +72,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(registry, "_own", {})
-    monkeypatch.setenv(registry.OWN, "{}")
+    monkeypatch.setenv(registry.OWN_VARIABLE, "{}")
     yield tmp_path
     forget_modules(tmp_path)
 

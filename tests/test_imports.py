@@ -135,7 +135,7 @@ from offbench.rollouts.rollouts import Rollouts, gathered
 
 with Rollouts(env_spec("InvertedPendulum-v5"), workers=1) as rollouts:
     policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
-    print(len(gathered(rollouts.outcomes(policy, 0, (), 3, True))), "episodes")
+    print(len(gathered(rollouts.start_evaluation(policy, 0, (), 3, True))), "episodes")
     loaded = "set(__import__('sys').modules) & {'torch', 'stable_baselines3'}"
     print("worker has", list(rollouts._pool.submit(eval, loaded).result()))
 """

@@ -27,15 +27,18 @@ def behaviour(
 
     Args:
         env: a shipped recipe's name, a recipe file, or a Recipe.
-        seed: of the training. The same recipe and seed end with the same weights.
+        seed: of the training. The same recipe and seed give the same weights.
         steps: environment steps; default: the recipe's. Steps beyond the recipe's use its final learning
-            rate; fewer than already trained builds the ladder of the first `steps`.
+            rate. If more are trained already, the ladder is built from the first `steps`.
         workers: processes that measure the rungs (training itself is one process of one thread).
         behaviour_dir: the folder of all trainings.
-        out: where the ladder goes; default: `ladder` in the training's folder.
+        out: the folder of the ladder; default: `ladder` in the training's folder.
 
     Returns:
         The ladder.
+
+    Raises:
+        OffbenchError: a bad argument, a folder of another training, or no policy better than random actions.
     """
     recipe, seed = load_recipe(env) if isinstance(env, str) else env, check_seed(seed)
     steps = recipe.sac.steps if steps is None else steps

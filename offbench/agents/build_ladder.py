@@ -7,8 +7,8 @@
         -> ladder/  ladder.json  ladder.csv  policies/*.safetensors  medium-replay.hdf5
 
 Returns are of the sampling policy, normalized between the uniform-random and the expert reference. Policies within
-segments are looked at where no rung at the end of a segment fits. A rung is chosen on one set of episodes; the
-expert's reference score is measured on another, so that it is not flattered by the choice.
+segments are considered if no rung at the end of a segment fits. A rung is chosen on one set of episodes; the
+expert's reference score is measured on another, so that the choice does not bias it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from offbench.agents.ladder import MEDIUM, MEDIUM_AT_MOST, Ladder, put_back, read_ladder, replaced_by
+from offbench.agents.ladder import MEDIUM, MEDIUM_AT_MOST, Ladder, read_ladder, replaced_folder, restore_replaced
 from offbench.agents.medium_replay import replay_episodes, save_replay
 from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common.errors import OffbenchError
@@ -41,10 +41,10 @@ from offbench.common.terminal import inform
 from offbench.envs.environments import make_env, spaces_of
 from offbench.envs.recipes import Recipe
 from offbench.rollouts.policy import Policy, load_policy, uniform
-from offbench.rollouts.rollouts import MEASURES, Outcome, Rollouts, gathered, summary
+from offbench.rollouts.rollouts import MEASURES, EpisodeStats, Rollouts, gathered, summary
 
-CANDIDATES = 8  # late rungs that are measured to choose the expert
-LOOKS = 6  # rungs that are measured to find the one nearest a return
+EXPERT_CANDIDATES = 8  # late rungs measured to choose the expert
+MOST_MEASURED = 6  # policies measured to find the one nearest a return
 CROSSINGS = 3  # pairs of neighboring rungs between which policies within a segment are screened
 MEASURED = "measured.json"  # in a training's folder: a build that was interrupted resumes from it
 COLUMNS = ("step", "hours", "role", "policy", *MEASURES, *(f"deterministic_{m}" for m in MEASURES), "episodes")
@@ -76,7 +76,7 @@ class RungEvaluator:
         self._earlier: dict[str, JsonObject] = {"screened": {}, "measured": {}}  # by the step as text
 
     def resume(self) -> None:
-        """Let what an earlier call measured in this folder, with the same packages and number of episodes, be reused.
+        """Reuse what an earlier call measured in this folder with the same packages and number of episodes.
 
         The choice is the same as without it: a policy counts as measured once this call asks for it.
         """
@@ -85,14 +85,14 @@ class RungEvaluator:
             return
         with damage(str(path), "is damaged", "delete it"):
             table = read_json(path, "delete it")
-            if table["made"] == self._made():
+            if table["made"] == self._conditions():
                 self._earlier = {name: dict(table[name]) for name in self._earlier}
 
     def _save(self, table: str, step: int, value: float | dict[str, float]) -> None:
         self._earlier[table][str(step)] = value
-        write_json(self.folder.path / MEASURED, {"made": self._made(), **self._earlier})
+        write_json(self.folder.path / MEASURED, {"made": self._conditions(), **self._earlier})
 
-    def _made(self) -> dict[str, str | int]:
+    def _conditions(self) -> dict[str, str | int]:
         episodes = self.folder.recipe.measure.rung_episodes
         return {name: versions()[name] for name in PHYSICS} | {"episodes": episodes}
 
@@ -118,9 +118,11 @@ class RungEvaluator:
         policy, stream = load_policy(self.folder.policy(step)), (int(Purpose.RUNG), step, 0)
         return summary(self.run(policy, stream, self.folder.recipe.sac.rung_episodes))["return"]
 
-    def run(self, policy: Policy, stream: tuple[int, ...], count: int, deterministic: bool = False) -> list[Outcome]:
+    def run(
+        self, policy: Policy, stream: tuple[int, ...], count: int, deterministic: bool = False
+    ) -> list[EpisodeStats]:
         """Play evaluation episodes."""
-        return gathered(self.rollouts.outcomes(policy, self.folder.seed, stream, count, deterministic))
+        return gathered(self.rollouts.start_evaluation(policy, self.folder.seed, stream, count, deterministic))
 
     def estimate(self, step: int) -> float:
         """Return the return of a policy, as measured, or as screened if it was not measured."""
@@ -135,13 +137,13 @@ class RungEvaluator:
         last = max(self.screened)
         late = [step for step in self.screened if step > last / 2]
         late.sort(key=lambda step: self.screened[step]["stochastic_return"], reverse=True)
-        return max(late[:CANDIDATES], key=self.measure)
+        return max(late[:EXPERT_CANDIDATES], key=self.measure)
 
     def medium(self, target: float, most: float, expert: int) -> int:
         """Return the first policy measured between `target` and `most`, else the one nearest to `target`."""
         early = [step for step in sorted(self.screened) if step <= expert]
         for before, step in pairwise([0, *early]):
-            # measure only what its screening interval says might lie there
+            # measure only rungs whose screening interval reaches the target
             if self.screened[step]["stochastic_high"] >= target and target <= self.measure(step) <= most:
                 return step
             if self._crosses(before, step, target, most):
@@ -175,10 +177,10 @@ class RungEvaluator:
     def _first_close(self, steps: Sequence[int], target: float, close: float) -> int | None:
         """Measure the most promising policies in turn; return the first within `close` of `target`, if one is.
 
-        The few episodes that screened them say where to look. It ends after LOOKS, or when no policy that was not
-        measured looks nearer than those that were.
+        The policy with the nearest estimated return comes first. The search ends after MOST_MEASURED policies, or when
+        a measured policy is nearer than the estimates of all others.
         """
-        for _ in range(LOOKS if steps else 0):
+        for _ in range(MOST_MEASURED if steps else 0):
             step = min(steps, key=lambda step: abs(self.estimate(step) - target))
             measured = step in self.measured
             if abs(self.measure(step) - target) <= close:
@@ -238,8 +240,8 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
         references = {"random": random_reference(folder.recipe, folder.seed, rollouts)}
         expert = evaluator.expert()
         policy = load_policy(folder.policy(expert))
-        outcomes = evaluator.run(policy, (int(Purpose.REFERENCE), 1), episodes)
-        references["expert"] = summary(outcomes) | {"episodes": episodes}
+        episode_stats = evaluator.run(policy, (int(Purpose.REFERENCE), 1), episodes)
+        references["expert"] = summary(episode_stats) | {"episodes": episodes}
         worst, best = references["random"]["return"], references["expert"]["return"]
         if best <= worst:
             raise OffbenchError(
@@ -279,8 +281,8 @@ def random_reference(recipe: Recipe, seed: int, rollouts: Rollouts) -> dict[str,
     observations, actions = spaces_of(make_env(recipe.env_spec()), recipe.env_id)
     policy = uniform(actions.low, actions.high, observations.shape[0], recipe.env_id)
     episodes = recipe.measure.reference_episodes
-    outcomes = gathered(rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 0), episodes, False))
-    return summary(outcomes) | {"episodes": episodes}
+    episode_stats = gathered(rollouts.start_evaluation(policy, seed, (int(Purpose.REFERENCE), 0), episodes, False))
+    return summary(episode_stats) | {"episodes": episodes}
 
 
 def _write(out: Path, evaluator: RungEvaluator, roles: dict[int, str], info: JsonObject) -> None:
@@ -288,7 +290,7 @@ def _write(out: Path, evaluator: RungEvaluator, roles: dict[int, str], info: Jso
     folder = evaluator.folder
     temporary = out.with_name(f".{out.name}.partial")
     with disk_errors(str(out)):
-        put_back(out)
+        restore_replaced(out)
         delete(temporary)
         (temporary / "policies").mkdir(parents=True)
         for step in roles:
@@ -301,7 +303,7 @@ def _write(out: Path, evaluator: RungEvaluator, roles: dict[int, str], info: Jso
         if folder.recipe.replay_envs:
             info["medium_replay"] |= {"envs": folder.recipe.replay_envs}
         write_json(temporary / "ladder.json", info)
-        old = replaced_by(out)
+        old = replaced_folder(out)
         delete(old)
         if out.exists():
             out.replace(old)

@@ -1,4 +1,4 @@
-"""The ladder: the rungs of a behaviour agent that recording needs, as they lie in a folder.
+"""The ladder: the rungs of a behaviour agent that recording needs, in one folder.
 
     ladder.json  ladder.csv  policies/*.safetensors  medium-replay.hdf5        (built by offbench.agents.build_ladder)
 
@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, damage, disk_errors, exclusive_lock, read_json, regular
-from offbench.common.scores import LARGEST, are_references, normalize
+from offbench.common.files import JsonObject, damage, disk_errors, exclusive_lock, open_regular, read_json
+from offbench.common.scores import LARGEST_VALUE, are_references, normalize
 from offbench.common.settings import read_back
 from offbench.common.terminal import inform, warn
 from offbench.envs.environments import same_environment
@@ -28,11 +28,11 @@ from offbench.envs.recipes import Recipe, load_recipe, names
 from offbench.envs.version_warning import warn_other_physics
 from offbench.rollouts.policy import Policy, load_policy
 
-BEHAVIOUR = Path("behaviour")  # where trainings live unless the user says otherwise
+BEHAVIOUR = Path("behaviour")  # default folder of all trainings
 MEDIUM = 1 / 3  # of the expert's normalized return
 MEDIUM_AT_MOST = 0.45  # a rung beyond this is chosen as medium only if there is no other
-MEDIUM_LIMITS = (0.2, 0.6)  # a medium beyond these is recorded only if the user accepts it
-NEAR = 0.05  # a rung this near a wanted fraction is taken for it; others only if the user accepts them
+MEDIUM_LIMITS = (0.2, 0.6)  # a medium outside these needs --accept
+NEAR = 0.05  # largest distance of a rung from a requested fraction; others need --accept
 POLICY_NAME = re.compile(r"\w[\w.-]*\.safetensors")  # a file of the ladder's own folder, nothing else
 REFERENCE = ("return", "low", "high", "episodes")  # what each reference must have
 
@@ -52,7 +52,7 @@ class Rung:
 
 @dataclass(frozen=True)
 class Replay:
-    """What a ladder.json says of medium-replay.hdf5. `envs`: the recipe's `replay_envs`."""
+    """The entry of medium-replay.hdf5 in ladder.json. `envs`: the recipe's `replay_envs`."""
 
     transitions: int
     sha256: str
@@ -86,7 +86,7 @@ class LadderInfo:
 
 @dataclass(frozen=True)
 class Ladder:
-    """A ladder's folder, read."""
+    """A ladder as read from its folder."""
 
     folder: Path
     info: LadderInfo
@@ -127,12 +127,12 @@ class Ladder:
     def check(self, recipe: Recipe) -> Ladder:
         """Return itself; raise OffbenchError if it is of another environment than the recipe."""
         kwargs = json.loads(json.dumps(dict(recipe.env_kwargs)))
-        mine = (self.info.env_id, self.info.env_kwargs, self.info.contact_margin)
+        built = (self.info.env_id, self.info.env_kwargs, self.info.contact_margin)
         wanted = (recipe.env_id, kwargs, recipe.contact_margin)
-        if mine != wanted:
-            ours, its = (f"{name} {arguments} with contact_margin {rule}" for name, arguments, rule in (mine, wanted))
+        if built != wanted:
+            old, new = (f"{name} {arguments} with contact_margin {rule}" for name, arguments, rule in (built, wanted))
             raise OffbenchError(
-                f"the ladder in {self.folder} is of {ours}, the recipe is of {its}; delete that folder, or rename "
+                f"the ladder in {self.folder} is of {old}, the recipe is of {new}; delete that folder, or rename "
                 "the recipe"
             )
         return self
@@ -151,12 +151,12 @@ def read_ladder(folder: Path) -> Ladder | None:
     path = folder / "ladder.json"
     info = read_back(LadderInfo, read_json(path, remedy), path, remedy)
     with damage(f"the ladder in {folder}", "is damaged", remedy):
-        with open(folder / "ladder.csv", newline="", encoding="utf-8", opener=regular) as file:
+        with open(folder / "ladder.csv", newline="", encoding="utf-8", opener=open_regular) as file:
             rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
         ladder = Ladder(folder, info, rungs)
         numbers = [info.references[name][key] for name in ("random", "expert") for key in REFERENCE]
-        if not all(abs(number) < LARGEST for number in numbers):
-            raise ValueError(f"its references must be finite and below {LARGEST:g}")
+        if not all(abs(number) < LARGEST_VALUE for number in numbers):
+            raise ValueError(f"its references must be finite and below {LARGEST_VALUE:g}")
         if not are_references(ladder.random_return, ladder.expert_return):
             raise ValueError("its references are equal, or out of order")
         if not (info.levels["medium"] and ladder.role("medium") and ladder.role("expert")):
@@ -167,7 +167,7 @@ def read_ladder(folder: Path) -> Ladder | None:
 
 
 def folder_of(recipe: Recipe, seed: int, behaviour_dir: Path) -> Path:
-    """Return where the training of a recipe and seed lives."""
+    """Return the folder of the training of a recipe and seed."""
     return behaviour_dir / recipe.name / f"seed-{seed}"
 
 
@@ -179,9 +179,9 @@ def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool =
     """
     shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder and not retrain else None
     trained = folder_of(recipe, 0, behaviour_dir) / "ladder"
-    if not shipped and replaced_by(trained).exists():
+    if not shipped and replaced_folder(trained).exists():
         with contextlib.suppress(OffbenchError), exclusive_lock(trained.parent / ".lock", str(trained)):
-            put_back(trained)
+            restore_replaced(trained)
     ladder = shipped or read_ladder(trained)
     if ladder is None:
         return None
@@ -193,21 +193,21 @@ def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool =
     return ladder
 
 
-def replaced_by(folder: Path) -> Path:
-    """Return where a ladder is while another one takes its place."""
+def replaced_folder(folder: Path) -> Path:
+    """Return the path that a ladder has while another one replaces it."""
     return folder.with_name(f".{folder.name}.old")
 
 
-def put_back(folder: Path) -> None:
-    """Put back a ladder whose writer was killed between its two renames; the training's lock must be held."""
-    old = replaced_by(folder)
+def restore_replaced(folder: Path) -> None:
+    """Restore a ladder whose writer was killed between its two renames; the training's lock must be held."""
+    old = replaced_folder(folder)
     if not folder.exists() and (old / "ladder.json").is_file():
         with disk_errors(str(folder)):
             old.replace(folder)
 
 
 def _warn_other_recipe(ladder: Ladder, recipe: Recipe) -> None:
-    """Say which settings of the recipe have been changed since the agent was trained."""
+    """Warn about settings of the recipe that have changed since the agent was trained."""
     used, wanted = ladder.info.sac, json.loads(json.dumps(dataclasses.asdict(recipe.sac)))
     changed = [key for key, value in wanted.items() if used.get(key, value) != value]
     if changed:
@@ -218,7 +218,7 @@ def _warn_other_recipe(ladder: Ladder, recipe: Recipe) -> None:
 
 
 def shipped_references(spec: str) -> tuple[float, float] | None:
-    """Return the (random, expert) returns shipped for an environment (EnvSpec JSON); None if there are none of it."""
+    """Return the (random, expert) returns shipped for an environment (EnvSpec JSON); None if none are shipped."""
     for name in names():
         recipe = load_recipe(name)
         # the id first: making the spec of every recipe takes a while
@@ -232,5 +232,5 @@ def shipped_references(spec: str) -> tuple[float, float] | None:
 def _rung(row: dict[str, str]) -> Rung:
     mean, low, high = (float(row[key]) for key in ("return", "low", "high"))
     if not np.isfinite([mean, low, high]).all() or not POLICY_NAME.fullmatch(row["policy"]):
-        raise ValueError(f"rung {row['step']}")
+        raise ValueError(f"rung {row['step']} has a number that is not finite, or a bad policy name")
     return Rung(int(row["step"]), row["role"], row["policy"], mean, low, high, int(row["episodes"]))

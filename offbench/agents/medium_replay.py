@@ -32,8 +32,8 @@ CHUNK_ROWS = 65_536
 NO_SEED = -1  # episodes of a training have no reset seed of their own
 
 
-class Piece(NamedTuple):
-    """An episode of the training as the replay buffer holds it: float32, actions in [-1, 1]."""
+class ReplayEpisode(NamedTuple):
+    """An episode of SAC's replay buffer: float32, actions in [-1, 1]."""
 
     observations: Array
     actions: Array
@@ -42,7 +42,7 @@ class Piece(NamedTuple):
     stream: int
 
 
-def replay_episodes(folder: TrainingFolder, until: int) -> Iterator[Piece]:
+def replay_episodes(folder: TrainingFolder, until: int) -> Iterator[ReplayEpisode]:
     """Yield the episodes of a training's first `until` steps, segment by segment, stream by stream.
 
     Of the streams, one for each environment, only the recipe's `replay_envs` are kept.
@@ -54,11 +54,11 @@ def replay_episodes(folder: TrainingFolder, until: int) -> Iterator[Piece]:
         rows = (until - start) // streams  # all of them, except in the segment that `until` lies in
         arrays = {name: array[:rows] for name, array in arrays.items()}
         for stream in range(min(streams, folder.recipe.replay_envs or streams)):
-            yield from _cut({name: array[:, stream] for name, array in arrays.items()}, stream)
+            yield from _split_at_ends({name: array[:, stream] for name, array in arrays.items()}, stream)
 
 
-def _cut(arrays: dict[str, Array], stream: int) -> Iterator[Piece]:
-    """Cut one stream of a segment where its episodes end. SB3's `dones` holds both kinds of end."""
+def _split_at_ends(arrays: dict[str, Array], stream: int) -> Iterator[ReplayEpisode]:
+    """Split one environment's stream of a segment into episodes; SB3's `dones` include truncations."""
     dones, timeouts = arrays["dones"].astype(bool), arrays["timeouts"].astype(bool)
     first = 0
     for last in [*np.flatnonzero(dones), len(dones) - 1]:
@@ -67,29 +67,29 @@ def _cut(arrays: dict[str, Array], stream: int) -> Iterator[Piece]:
         rows = slice(first, last + 1)
         observations = np.concatenate([arrays["observations"][rows], arrays["next_observations"][last : last + 1]])
         ended = bool(dones[last] and not timeouts[last])
-        yield Piece(observations, arrays["actions"][rows], arrays["rewards"][rows], ended, stream)
+        yield ReplayEpisode(observations, arrays["actions"][rows], arrays["rewards"][rows], ended, stream)
         first = last + 1
 
 
-def save_replay(path: Path, pieces: Iterator[Piece]) -> dict[str, int | str]:
+def save_replay(path: Path, episodes: Iterator[ReplayEpisode]) -> dict[str, int | str]:
     """Write episodes to one compressed HDF5 file; return its transitions, episodes and SHA-256."""
-    whole = list(pieces)
+    listed = list(episodes)
     arrays: dict[str, Array] = {
-        "observations": np.concatenate([p.observations for p in whole]).astype(np.float32),
-        "actions": np.concatenate([p.actions for p in whole]).astype(np.float32),
-        "rewards": np.concatenate([p.rewards for p in whole]).astype(np.float32),
-        "lengths": np.array([len(p.rewards) for p in whole], np.int64),
-        "terminated": np.array([p.terminated for p in whole]),
-        "stream": np.array([p.stream for p in whole], np.int64),
+        "observations": np.concatenate([p.observations for p in listed]).astype(np.float32),
+        "actions": np.concatenate([p.actions for p in listed]).astype(np.float32),
+        "rewards": np.concatenate([p.rewards for p in listed]).astype(np.float32),
+        "lengths": np.array([len(p.rewards) for p in listed], np.int64),
+        "terminated": np.array([p.terminated for p in listed]),
+        "stream": np.array([p.stream for p in listed], np.int64),
     }
     data = io.BytesIO()
     with h5py.File(data, "w") as file:
         for name, array in arrays.items():
-            # column by column and byte by byte: what the floats of one quantity share lies together
+            # one column per chunk, shuffled by bytes: similar bytes are adjacent and compress well
             chunks = (min(len(array), CHUNK_ROWS), *(1 for _ in array.shape[1:]))
             file.create_dataset(name, data=array, chunks=chunks, compression="gzip", compression_opts=6, shuffle=True)
     write_bytes(path, data.getvalue())
-    return {"transitions": len(arrays["rewards"]), "episodes": len(whole), "sha256": sha256(data.getvalue())}
+    return {"transitions": len(arrays["rewards"]), "episodes": len(listed), "sha256": sha256(data.getvalue())}
 
 
 def load_replay(
@@ -134,8 +134,8 @@ def _arrays(data: bytes, obs: int, act: int) -> dict[str, Array]:
             raise ValueError(f"{elsewhere} is not data of this file")
         columns = {name: file[name] for name in ("observations", "actions", "rewards", "lengths", "terminated")}
         for name, column in columns.items():
-            kinds = {"lengths": "iu", "terminated": "biu"}.get(name, "f")
-            if column.dtype.kind not in kinds or column.nbytes > MOST_COMPRESSED * len(data):
+            dtype_kinds = {"lengths": "iu", "terminated": "biu"}.get(name, "f")
+            if column.dtype.kind not in dtype_kinds or column.nbytes > MOST_COMPRESSED * len(data):
                 raise ValueError(f"{name} are {column.dtype} {column.shape}")
         arrays: dict[str, Array] = {name: column[()] for name, column in columns.items()}
     steps, episodes = len(arrays["rewards"]), len(arrays["lengths"])

@@ -7,8 +7,8 @@
                                                                      -->  checkpoint (weights, optimizers)
 
 A segment depends only on the checkpoint before it and on k, so a training that was killed and resumed ends
-with the same bits as one that was not. The price is that episodes running at a segment's end are truncated.
-Ctrl-C and SIGTERM save a checkpoint where they arrive, from which a resume ends with the same bits, too.
+with the same bits as one that was not. In return, episodes that are running at a segment's end are truncated.
+Ctrl-C and SIGTERM save a checkpoint at once; a resume from it ends with the same bits, too.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from offbench.common.files import (
     write_bytes,
     write_json,
 )
-from offbench.common.interrupts import stops_noted
+from offbench.common.interrupts import collect_stop_signals
 from offbench.common.progress import Progress, duration
 from offbench.common.provenance import hardware, versions
 from offbench.common.seeds import Purpose
@@ -53,14 +53,19 @@ from offbench.envs.environments import Env, make_env
 from offbench.envs.margin_rule import EARLIER
 from offbench.envs.recipes import Recipe, SACSettings
 from offbench.rollouts.policy import Policy
-from offbench.rollouts.rollouts import MEASURES, Named, Rollouts, gathered, summary
+from offbench.rollouts.rollouts import MEASURES, ErrorReporting, Rollouts, gathered, summary
 
-SCREENED = ("step", "hours", *(f"{how}_{m}" for how in ("stochastic", "deterministic") for m in MEASURES), "episodes")
-POLICIES = 100  # of a segment at most, its rung included,
-POLICY_BYTES = 6_000_000  # and as many as fit in this: 20 of hopper's
-FAR_APART = 0.05  # of the range of returns so far: half the distance between the rungs of a ladder
-STEP_WORK = 0.02  # time of an environment step, in gradient steps: for the time left
-PROBE = 1.0  # seconds at most that the estimate of a training's time takes
+RUNG_COLUMNS = (
+    "step",
+    "hours",
+    *(f"{how}_{m}" for how in ("stochastic", "deterministic") for m in MEASURES),
+    "episodes",
+)
+MOST_POLICIES = 100  # most policies kept of a segment, its rung included
+POLICY_BYTES = 6_000_000  # most bytes of a segment's policies: 20 of hopper's
+LARGE_CHANGE = 0.05  # share of the range of returns; after a smaller change, policies within a segment are deleted
+STEP_WORK = 0.02  # time of an environment step in units of gradient steps, to estimate the time left
+PROBE = 1.0  # most seconds spent on estimating the training's time
 PROBE_CYCLES, WARM_UP = 50, 4
 
 
@@ -91,8 +96,8 @@ def _check_identity(folder: TrainingFolder) -> None:
         return
     recorded = read_json(path, f"delete {folder.path} to train the agent again")
     recorded = {"contact_margin": EARLIER} | recorded  # the only rule of earlier versions
-    started = _flat({key: value for key, value in recorded.items() if key in identity})
-    wanted = _flat(json.loads(json.dumps(identity)))
+    started = _flattened({key: value for key, value in recorded.items() if key in identity})
+    wanted = _flattened(json.loads(json.dumps(identity)))
     changed = [key for key in started | wanted if started.get(key) != wanted.get(key)]
     if changed:
         old, new = (table.get(changed[0], "none") for table in (started, wanted))
@@ -102,7 +107,7 @@ def _check_identity(folder: TrainingFolder) -> None:
         )
 
 
-def _say_other_versions(folder: TrainingFolder) -> None:
+def _warn_other_versions(folder: TrainingFolder) -> None:
     """Warn if this training was started with other versions of the packages that it depends on."""
     before = read_json(folder.path / "training.json", f"delete {folder.path} to train the agent again")["versions"]
     if changed := [f"{name} {old}, not {now}" for name, now in versions().items() if (old := before.get(name)) != now]:
@@ -111,7 +116,7 @@ def _say_other_versions(folder: TrainingFolder) -> None:
         )
 
 
-def _flat(table: JsonObject) -> JsonObject:
+def _flattened(table: JsonObject) -> JsonObject:
     """Return {"sac.steps": ...} of {"sac": {"steps": ...}}."""
     inner = {
         f"{key}.{name}": v for key, value in table.items() if isinstance(value, dict) for name, v in value.items()
@@ -124,18 +129,18 @@ def _train(folder: TrainingFolder, steps: int) -> None:
     recipe, settings = folder.recipe, folder.recipe.sac
     torch.set_num_threads(1)
     title, spec = f"SAC on {recipe.name}", recipe.env_spec()
-    with stops_noted(second_at_once=True) as stops, Rollouts(spec) as rollouts:
-        pace = _seconds_of_a_gradient_step(recipe, spec)  # draws from the generators that a checkpoint restores
+    with collect_stop_signals(second_at_once=True) as stops, Rollouts(spec) as rollouts:
+        step_seconds = _measure_gradient_step(recipe, spec)  # draws from the generators that a checkpoint restores
         model = _make_sac(recipe, spec, steps + settings.segment)
         seconds = _start_or_resume(folder, model)
         rows = [row for row in read_rungs(folder.rungs) if row["step"] <= model.num_timesteps]
         with Progress(steps, title, work=_work(settings, steps)) as progress:
             progress.skip(model.num_timesteps, _work(settings, model.num_timesteps))
             if model.num_timesteps:
-                _say_other_versions(folder)
-            progress.say(_plan(recipe, pace, model.num_timesteps, steps))
+                _warn_other_versions(folder)
+            progress.print_line(_plan(recipe, step_seconds, model.num_timesteps, steps))
             while model.num_timesteps < steps and not stops:
-                start = time.process_time()  # of one thread: what else runs on the machine does not count
+                start = time.process_time()  # CPU time, which other programs do not affect
                 finished = _train_segment(folder, model, progress, stops)
                 seconds += time.process_time() - start
                 if finished:
@@ -148,27 +153,27 @@ def _train(folder: TrainingFolder, steps: int) -> None:
                 elif model.num_timesteps % settings.segment:
                     save_within_segment(folder, model, seconds)
             if stops and model.num_timesteps:
-                progress.say(f"{title}: stopped at step {model.num_timesteps:,}, checkpoint saved")
+                progress.print_line(f"{title}: stopped at step {model.num_timesteps:,}, checkpoint saved")
 
 
 def _work(settings: SACSettings, step: int) -> float:
-    """Return the time that `step` environment steps take, in gradient steps."""
+    """Return the time that `step` environment steps take, in units of gradient steps."""
     return STEP_WORK * step + settings.gradient_steps * max(step - settings.learning_starts, 0)
 
 
-def _plan(recipe: Recipe, pace: float, first: int, steps: int) -> str:
+def _plan(recipe: Recipe, step_seconds: float, first: int, steps: int) -> str:
     """Return a line that says what is trained, and how long it will take on this machine."""
     updates = round(recipe.sac.gradient_steps * max(steps - max(first, recipe.sac.learning_starts), 0))
     start = f"resuming from step {first:,} of" if first else "training for"
-    seconds = pace * (_work(recipe.sac, steps) - _work(recipe.sac, first))
+    seconds = step_seconds * (_work(recipe.sac, steps) - _work(recipe.sac, first))
     return (
         f"SAC on {recipe.name}: {start} {steps:,} environment steps, {updates:,} gradient steps to go: "
         f"about {duration(seconds)} on one core; Ctrl-C saves a checkpoint, and the same command resumes"
     )
 
 
-def _seconds_of_a_gradient_step(recipe: Recipe, spec: str) -> float:
-    """Measure a gradient step of this recipe, with its share of environment steps, on a model made for it."""
+def _measure_gradient_step(recipe: Recipe, spec: str) -> float:
+    """Return the seconds of a gradient step of this recipe, measured on a new model with its environment steps."""
     settings = dataclasses.replace(recipe.sac, learning_starts=0)
     cycle = settings.cycle()[0] * settings.envs
     model = _make_sac(dataclasses.replace(recipe, sac=settings), spec, (WARM_UP + PROBE_CYCLES) * cycle)
@@ -186,15 +191,15 @@ def _make_sac(recipe: Recipe, spec: str, buffer_size: int) -> SAC:
     settings = recipe.sac
     cycle, gradient_steps = settings.cycle()
 
-    def single() -> Env:
+    def make_single_env() -> Env:
         # float32 halves the replay buffer; the medium-replay level keeps exactly what SAC saw
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # Gymnasium's remark on the bounds' precision
-            return gym.wrappers.DtypeObservation(Named(make_env(spec)), np.float32)
+            return gym.wrappers.DtypeObservation(ErrorReporting(make_env(spec)), np.float32)
 
     model = SAC(
         "MlpPolicy",
-        DummyVecEnv([single] * settings.envs),
+        DummyVecEnv([make_single_env] * settings.envs),
         learning_rate=settings.learning_rate,
         buffer_size=buffer_size,
         learning_starts=settings.learning_starts,
@@ -241,7 +246,7 @@ def _train_segment(folder: TrainingFolder, model: SAC, progress: Progress, stops
     start = model.num_timesteps // settings.segment * settings.segment
     end, cycle = start + settings.segment, settings.cycle()[0] * settings.envs
     keep_every = cycle * math.ceil(
-        settings.segment / cycle / min(POLICIES, max(POLICY_BYTES // _actor_bytes(model), 1))
+        settings.segment / cycle / min(MOST_POLICIES, max(POLICY_BYTES // _actor_bytes(model), 1))
     )
     if model.num_timesteps == start:
         _start_segment(folder, model, start)
@@ -266,7 +271,7 @@ def _actor_bytes(model: SAC) -> int:
 def _end_segment(
     folder: TrainingFolder, model: SAC, rollouts: Rollouts, rows: Sequence[dict[str, float]], seconds: float
 ) -> dict[str, float]:
-    """Screen the rung at the end of a segment and write what the segment made; return its row of rungs.csv.
+    """Screen the rung at the end of a segment and write the segment's files; return its row of rungs.csv.
 
     The checkpoint is written last: only then is the segment complete.
     """
@@ -276,14 +281,16 @@ def _end_segment(
     returns = [before["stochastic_return"] for before in (*rows, row)]
     with disk_errors(str(folder.path)):
         policy.save(folder.policy(step))
-        if len(returns) > 1 and abs(returns[-1] - returns[-2]) < FAR_APART * (max(returns) - min(returns)):
+        if len(returns) > 1 and abs(returns[-1] - returns[-2]) < LARGE_CHANGE * (max(returns) - min(returns)):
             for other in folder.policy_steps():
                 if step - segment < other < step:
                     folder.policy(other).unlink()
         arrays: dict[str, Any] = transitions_since(model, step - segment)
         np.savez(transitions := io.BytesIO(), **arrays)
         write_bytes(folder.transitions(step), transitions.getvalue())
-        write_bytes(folder.rungs, csv_bytes(SCREENED, ([values[key] for key in SCREENED] for values in (*rows, row))))
+        write_bytes(
+            folder.rungs, csv_bytes(RUNG_COLUMNS, ([values[key] for key in RUNG_COLUMNS] for values in (*rows, row)))
+        )
         save_segment_end(folder, model, seconds)
     return row
 
@@ -294,8 +301,8 @@ def _screen(folder: TrainingFolder, rollouts: Rollouts, policy: Policy, step: in
     row: dict[str, float] = {"episodes": episodes}
     for how, deterministic in (("stochastic", False), ("deterministic", True)):
         stream = (int(Purpose.RUNG), step, int(deterministic))
-        outcomes = gathered(rollouts.outcomes(policy, folder.seed, stream, episodes, deterministic))
-        row |= summary(outcomes, f"{how}_")
+        episode_stats = gathered(rollouts.start_evaluation(policy, folder.seed, stream, episodes, deterministic))
+        row |= summary(episode_stats, f"{how}_")
     return row
 
 

@@ -63,7 +63,7 @@ def _keep_newest(folder: TrainingFolder, newest: int) -> None:
 
 
 def restore(folder: TrainingFolder, model: SAC, start_segment: Callable[[int], None]) -> float:
-    """Put the newest usable checkpoint back into `model`.
+    """Load the newest usable checkpoint into `model`.
 
     Args:
         folder: of the training.

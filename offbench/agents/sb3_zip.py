@@ -1,6 +1,6 @@
 """The policy in a zip that Stable-Baselines3 saved: SAC, TD3, DDPG, PPO and A2C with MLP policies.
 
-Such a zip holds pickled data, which can run anything when it is loaded. Only two members are read here: policy.pth, by
+Such a zip holds pickled data, which can run any code when it is loaded. Only two members are read here: policy.pth, by
 `torch.load(weights_only=True)`, which loads only tensors, and `data`, as JSON text, for the name of the activation and
 the bounds of the actions.
 """
@@ -20,7 +20,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, damage, regular
+from offbench.common.files import JsonObject, damage, open_regular
 from offbench.rollouts.policy import ACTIVATIONS, Layers, Policy
 
 LARGEST = 2**30  # bytes of a member, unpacked
@@ -30,7 +30,7 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
     """Return the policy of an SB3 agent; nothing of the zip is unpickled.
 
     Args:
-        low, high: [act], the bounds of the environment's actions, for a zip that does not say its own.
+        low, high: [act], the bounds of the environment's actions, used if the zip does not hold them.
 
     Raises:
         OffbenchError: not such a zip, a damaged or malicious one, a policy that is not an MLP's, or one for
@@ -68,7 +68,7 @@ def _read(path: Path) -> tuple[dict[str, Array], JsonObject]:
     """
     import torch
 
-    with open(path, "rb", opener=regular) as file, zipfile.ZipFile(file) as archive:
+    with open(path, "rb", opener=open_regular) as file, zipfile.ZipFile(file) as archive:
         for name in ("policy.pth", "data"):
             if archive.getinfo(name).file_size > LARGEST:
                 raise ValueError(f"{name} is larger than {LARGEST:,} bytes")
@@ -133,7 +133,7 @@ def _sequence(tensors: Mapping[str, Array], name: str) -> Layers:
 
 
 def _bounds(settings: JsonObject, name: str, default: Array, actions: int) -> Array:
-    """Return [actions], the lower or upper bounds of the agent's actions by the text that SB3 writes of its space."""
+    """Return [actions], the lower or upper action bounds, parsed from SB3's text of the action space."""
     space = settings.get("action_space")
     text = str(space.get(name, "")) if isinstance(space, dict) else ""
     numbers = re.findall(r"-?\d+(?:\.\d*)?(?:e[+-]?\d+)?", text)
@@ -143,7 +143,7 @@ def _bounds(settings: JsonObject, name: str, default: Array, actions: int) -> Ar
 
 
 def _activation(path: Path, settings: JsonObject, default: str) -> str:
-    """Return the activation by the text of policy_kwargs, where SB3 repeats what it pickles."""
+    """Return the activation, parsed from SB3's text of policy_kwargs."""
     kwargs = settings.get("policy_kwargs")
     text = str(kwargs.get("activation_fn", "")) if isinstance(kwargs, dict) else ""
     name = re.sub(r"^<class '(?:\w+\.)*(\w+)'>$", r"\1", text).lower() or default

@@ -19,7 +19,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import damage, exclusive_lock, read_text, regular, remove_leftovers
+from offbench.common.files import damage, exclusive_lock, open_regular, read_text, remove_leftovers
 from offbench.envs.recipes import Recipe
 
 TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -40,7 +40,7 @@ class TrainingFolder:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the folder for this process, rid of leftovers. Raises OffbenchError if another one trains there."""
+        """Lock the folder and delete leftovers. Raises OffbenchError if another process trains there."""
         with exclusive_lock(self.path / ".lock", f"{self.path} is being trained"):
             for written in (self.path, self.path / "policies", self.path / "transitions"):
                 remove_leftovers(written)
@@ -68,7 +68,7 @@ class TrainingFolder:
         try:
             with (
                 damage(str(path), "is damaged", remedy),
-                open(path, "rb", opener=regular) as file,
+                open(path, "rb", opener=open_regular) as file,
                 np.load(file, allow_pickle=False) as arrays,
             ):
                 return {name: arrays[name] for name in TRANSITIONS}

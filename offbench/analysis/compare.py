@@ -9,7 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from offbench.analysis.methods import find_method
-from offbench.analysis.results import REFERENCES, Entry, Task, Trained, read_results, window_words, with_several_codes
+from offbench.analysis.results import (
+    REFERENCES,
+    Entry,
+    EvaluatedRun,
+    Task,
+    keys_with_mixed_code,
+    read_results,
+    window_text,
+)
 from offbench.analysis.statistics import Estimate, Paired, improvement, paired
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
@@ -63,7 +71,7 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Who is better, or that there is no evidence of a difference."""
+        """Which group is better, or that there is no evidence of a difference."""
         estimate, sizes = self.statistics.difference, Counter(pair.dataset for pair in self.pairs)
         over = f"{from_to(sizes.values())} {plural(max(sizes.values()), 'seed')}"
         over += f" on {len(sizes)} datasets" if len(sizes) > 1 else ""
@@ -76,7 +84,7 @@ class Comparison:
 
     @property
     def title(self) -> str:
-        """Who is compared with whom, and what the scores are normalized by."""
+        """The two groups, and what the scores are normalized by."""
         return f"{self.a} against {self.b} ({self.reference})"
 
     def table(self) -> tuple[list[str], list[list[str]]]:
@@ -156,7 +164,7 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
     groups = tuple(results.of(find_method(results.methods, name)) for name in (a, b))
     if groups[0] == groups[1]:
         raise OffbenchError(f"{a} and {b} are the same runs; give two groups")
-    both = partners(*groups)
+    both = pair_runs(*groups)
     if not both:
         raise OffbenchError(f"{a} and {b} share no dataset with a seed in common: there is nothing to pair")
     tasks = {task for task, *_ in both}
@@ -175,29 +183,29 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
         paired(differences(both)),
         improvement(_by_dataset(pairs, lambda pair: pair.a), _by_dataset(pairs, lambda pair: pair.b)),
         sum(len(entry.runs) for group in groups for entry in group) - 2 * len(both),
-        (window_words(trained[0]), window_words(trained[1])),
+        (window_text(trained[0]), window_text(trained[1])),
         comparable(both),
         sum(t.state != "finished" for side in trained for t in side),
-        tuple(with_several_codes((t.config.algorithm, t) for side in trained for t in side)),
+        tuple(keys_with_mixed_code((t.config.algorithm, t) for side in trained for t in side)),
     )
 
 
-Partners = Sequence[tuple[Task, Trained, Trained]]
+RunPairs = Sequence[tuple[Task, EvaluatedRun, EvaluatedRun]]
 
 
-def partners(a: Iterable[Entry], b: Iterable[Entry]) -> Partners:
+def pair_runs(a: Iterable[Entry], b: Iterable[Entry]) -> RunPairs:
     """Return the runs of A and of B that have the same dataset and seed, in order of A's."""
     others = {(entry.task, trained.seed): trained for entry in b for trained in entry.runs}
     mine = ((entry.task, trained) for entry in a for trained in entry.runs)
     return [(task, one, others[task, one.seed]) for task, one in mine if (task, one.seed) in others]
 
 
-def comparable(both: Partners) -> bool:
+def comparable(both: RunPairs) -> bool:
     """Return whether both runs of each pair are scored over evaluations at the same steps."""
     return all(one.window == other.window for _, one, other in both)
 
 
-def differences(both: Partners) -> dict[str, list[float]]:
+def differences(both: RunPairs) -> dict[str, list[float]]:
     """Return {task: score of A's run minus score of B's, for each pair}."""
     return _by_dataset(_scored(both), lambda pair: pair.a - pair.b)
 
@@ -210,7 +218,7 @@ def favored(statistics: Paired) -> int:
     return 1 if low > 0 else -1
 
 
-def _scored(both: Partners) -> list[Pair]:
+def _scored(both: RunPairs) -> list[Pair]:
     return [Pair(t.name, one.seed, one.score(t.reference), other.score(t.reference)) for t, one, other in both]
 
 

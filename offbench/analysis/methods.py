@@ -14,8 +14,8 @@ from offbench.training.run import RunConfig
 from offbench.training.spec import folder_name
 
 METHOD_ORDER = ("td3_bc", "cql", "bdb")  # of the BDB paper's Table 1
-BY_DATASET = "different for each dataset"  # the variant of a method that several variants are, on other datasets each
-OURS = FORMER_SETTINGS["bdb"].keys()  # settings that make an earlier version's BDB another method than the paper's
+BY_DATASET = "different for each dataset"  # variant of a method whose settings differ between datasets
+EXTENSION_SETTINGS = FORMER_SETTINGS["bdb"].keys()  # of bdb that are not the paper's
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Method:
         rest = [part for part in parts if not part.startswith("beta=")]
         if not beta and self.beta is not None:
             beta = [f"beta={self.beta}"]
-        words = (part.partition("=")[2] for part in beta)
-        return [word if word.isalpha() else f"beta={word}" for word in words] + rest
+        values = (part.partition("=")[2] for part in beta)
+        return [value if value.isalpha() else f"beta={value}" for value in values] + rest
 
     def named(self, without: Collection[str] = ()) -> str:
         """Return algorithm and settings as one name, some settings left out."""
@@ -65,7 +65,7 @@ class Method:
     @property
     def published(self) -> str:
         """The method's name in published/scores.csv; empty for what no paper has."""
-        if {part.partition("=")[0] for part in self.variant.split(",")} & OURS:
+        if {part.partition("=")[0] for part in self.variant.split(",")} & EXTENSION_SETTINGS:
             return ""
         return self.algorithm if self.beta is None else f"{self.algorithm} beta={self.beta}"
 
@@ -96,7 +96,7 @@ def name_methods(configs: Mapping[tuple[str, str], Sequence[RunConfig]]) -> dict
     for key, method in plain.items():
         siblings = [set(other.settings) for other in plain.values() if other.algorithm == method.algorithm]
         shared = {part for part in set.intersection(*siblings) if "=" in part}
-        shared = {part for part in shared if part.partition("=")[0] not in {*OURS, "beta"}}
+        shared = {part for part in shared if part.partition("=")[0] not in {*EXTENSION_SETTINGS, "beta"}}
         names[key] = labels[key] or method.named(shared)
     for longer in (Method.named, lambda method: f"{method.algorithm}/{method.variant}"):
         taken = Counter(name for name, _ in {(names[key], method) for key, method in plain.items()})
@@ -150,7 +150,7 @@ def find_method(methods: Sequence[Method], name: str) -> Method:
 def _beta(value: object) -> str | None:
     if isinstance(value, int | float) and abs(value) < 1e6:
         return text if float(text := f"{value:.2f}") == value else f"{value:g}"
-    # what a damaged config.json or another's algorithm has there
+    # of a damaged config.json or a third party's algorithm
     return None if value is None else f"{' '.join(str(value).split()):.60}"
 
 
@@ -160,5 +160,5 @@ def rank(name: str, order: Sequence[str]) -> tuple[int, str]:
 
 
 def method_order(method: Method) -> tuple[tuple[int, str], str, int, str]:
-    """Return what sorts methods as the paper's table has them: fixed betas in order, then the words (adaptive)."""
+    """Return the sort key for the order of the paper's table: numeric betas in order, then names (adaptive)."""
     return rank(method.algorithm, METHOD_ORDER), method.beta or "", len(method.variant), method.variant

@@ -1,4 +1,4 @@
-"""`normalize`: runs to a score table, returns to scores, and tables to text."""
+"""`normalize`: the score table of runs, the scores of returns, and their output as text."""
 
 from __future__ import annotations
 
@@ -61,15 +61,17 @@ def without_evaluation(runs: str | Path) -> tuple[int, int]:
 
 
 def _rows(entries: Collection[Entry]) -> list[Row]:
-    twins, mixed = any(entry.task.twin for entry in entries), mixed_code(entries)
-    return [_row(entry, twins) | {"one_code": (entry.task, entry.method.algorithm) not in mixed} for entry in entries]
+    ambiguous, mixed = any(entry.task.ambiguous for entry in entries), mixed_code(entries)
+    return [
+        _row(entry, ambiguous) | {"one_code": (entry.task, entry.method.algorithm) not in mixed} for entry in entries
+    ]
 
 
-def _row(entry: Entry, twins: bool) -> Row:
+def _row(entry: Entry, ambiguous: bool) -> Row:
     mean_return, _ = entry.mean_std(None) or (None, None)
     row: Row = {
         "dataset": entry.task.dataset,
-        **({"content": entry.task.content[:DIGITS]} if twins else {}),
+        **({"content": entry.task.content[:DIGITS]} if ambiguous else {}),
         "method": entry.method.label,
         "algorithm": entry.method.algorithm,
         "variant": entry.runs[0].config.variant,
@@ -84,9 +86,9 @@ def _row(entry: Entry, twins: bool) -> Row:
         mean, std = entry.mean_std(reference) or (None, None)
         row |= {column: mean, f"{column}_std": std}
         if reference == "dataset":
-            middle = None if mean is None else iqm({"": [trained.score(reference) for trained in entry.runs]})
-            ends = (middle.low, middle.high) if middle else (None, None)
-            row |= {"iqm": middle.value if middle else None, "iqm_low": ends[0], "iqm_high": ends[1]}
+            estimate = None if mean is None else iqm({"": [trained.score(reference) for trained in entry.runs]})
+            ends = (estimate.low, estimate.high) if estimate else (None, None)
+            row |= {"iqm": estimate.value if estimate else None, "iqm_low": ends[0], "iqm_high": ends[1]}
     return row
 
 
@@ -97,8 +99,8 @@ def score_returns(env: str, returns: Sequence[float]) -> list[Row]:
         OffbenchError: unknown environment, a return that is not finite, or no reference at all.
     """
     recipe = load_recipe(env)
-    if not all(abs(value) < scores.LARGEST for value in returns):
-        raise OffbenchError(f"returns must be finite numbers below {scores.LARGEST:g}, not {list(returns)}")
+    if not all(abs(value) < scores.LARGEST_VALUE for value in returns):
+        raise OffbenchError(f"returns must be finite numbers below {scores.LARGEST_VALUE:g}, not {list(returns)}")
     shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder else None
     ladder = shipped or read_ladder(folder_of(recipe, 0, BEHAVIOUR) / "ladder")
     ours = (ladder.random_return, ladder.expert_return) if ladder and ladder.check(recipe) else None
@@ -220,10 +222,12 @@ def notes(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         if "window" in row:
             windows.setdefault((row["dataset"], row.get("content")), set()).add(row["window"])
-    torn = sorted({dataset for (dataset, _), steps in windows.items() if len(steps) > 1 or None in steps})
+    incomparable = sorted({dataset for (dataset, _), steps in windows.items() if len(steps) > 1 or None in steps})
     lines = []
-    if torn:
-        lines.append(f"scores of {', '.join(torn)} are of evaluations at different steps and cannot be compared")
+    if incomparable:
+        lines.append(
+            f"scores of {', '.join(incomparable)} are of evaluations at different steps and cannot be compared"
+        )
     mixed = dict.fromkeys((row["algorithm"], row["dataset"]) for row in rows if not row.get("one_code", True))
     lines += [f"the runs of {algorithm} on {dataset} were trained by different code" for algorithm, dataset in mixed]
     if any("method" in row for row in rows):

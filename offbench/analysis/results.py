@@ -23,7 +23,7 @@ from offbench.analysis.methods import Method, find_method, method_order, name_me
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import READ_REMEDIES
-from offbench.common.scores import LAST, Evaluations, mean_std, normalize, run_return, window
+from offbench.common.scores import SCORED_EVALUATIONS, Evaluations, mean_std, normalize, run_return, window
 from offbench.common.terminal import warn
 from offbench.common.text import from_to, plural
 from offbench.data.levels import LEVELS
@@ -45,18 +45,18 @@ class Task:
     Attributes:
         content: its content hash; the same id may have been recorded twice.
         reference: what scores are normalized by: "dataset", "d4rl" or None (raw returns).
-        twin: whether another content goes by the same id.
+        ambiguous: whether runs used another content under the same id.
     """
 
     dataset: str
     content: str
     reference: str | None
-    twin: bool = False
+    ambiguous: bool = False
 
     @property
     def name(self) -> str:
         """The dataset's id, with its content's first digits where the id alone is ambiguous."""
-        return f"{self.dataset} ({self.content[:DIGITS]})" if self.twin else self.dataset
+        return f"{self.dataset} ({self.content[:DIGITS]})" if self.ambiguous else self.dataset
 
     @property
     def env_and_level(self) -> tuple[str, str]:
@@ -67,8 +67,8 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Trained:
-    """One run, what has been evaluated of it, and the rows of its losses.csv."""
+class EvaluatedRun:
+    """One run with its evaluations and the rows of its losses.csv."""
 
     run: Run
     config: RunConfig
@@ -92,7 +92,7 @@ class Trained:
 
     @property
     def steps(self) -> int:
-        """How far the run is to go."""
+        """The run's last step."""
         return self.config.steps
 
     @property
@@ -122,7 +122,7 @@ class Entry:
 
     task: Task
     method: Method
-    runs: tuple[Trained, ...]
+    runs: tuple[EvaluatedRun, ...]
 
     @property
     def scores(self) -> list[float]:
@@ -142,12 +142,12 @@ class Entry:
 
     @property
     def steps(self) -> int:
-        """How far the runs are to go."""
+        """The largest last step of the runs."""
         return max(trained.steps for trained in self.runs)
 
     @property
     def states(self) -> set[str]:
-        """How far the runs are: `finished`, `unfinished`, `diverged`."""
+        """The states of the runs: `finished`, `unfinished`, `diverged`."""
         return {trained.state for trained in self.runs}
 
     @property
@@ -169,11 +169,11 @@ class Entry:
 
     @property
     def smoothed(self) -> bool:
-        """Whether a picture of the learning curve shows means of several evaluations."""
+        """Whether a figure of the learning curve shows means of several evaluations."""
         return len(self.common_curve()[0]) > LONG_CURVE
 
     def drawn_curve(self) -> tuple[list[int], Array]:
-        """Return the common curve as pictures show it.
+        """Return the common curve as figures show it.
 
         Of more than LONG_CURVE evaluations, each point is the score that the runs would have if they ended there: the
         mean of the last evaluations up to it.
@@ -182,7 +182,7 @@ class Entry:
         if not self.smoothed:
             return steps, values
         ends = np.arange(1, len(steps) + 1)
-        counts = np.minimum(ends, LAST)
+        counts = np.minimum(ends, SCORED_EVALUATIONS)
         sums = np.pad(values, ((0, 0), (1, 0))).cumsum(1)
         return steps, (sums[:, ends] - sums[:, ends - counts]) / counts
 
@@ -195,7 +195,7 @@ class Results:
     tasks: tuple[Task, ...]
     methods: tuple[Method, ...]
     entries: Mapping[tuple[Task, Method], Entry]
-    waiting: tuple[Run, ...]  # claimed, not yet evaluated
+    unevaluated: tuple[Run, ...]  # started, not yet evaluated
 
     def of(self, method: Method) -> list[Entry]:
         """Return a method's entries in order of tasks."""
@@ -230,7 +230,7 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
     """
     roots = tuple(map(Path, [runs] if isinstance(runs, str | Path) else runs))
     unique = {run.folder.resolve(): run for root in roots for run in find_runs(root)}
-    entries, waiting = entries_of(unique.values())
+    entries, unevaluated = entries_of(unique.values())
     if not entries:
         below = ", ".join(map(str, roots))
         missing = "" if any(root.exists() for root in roots) else " (no such folder)"
@@ -242,17 +242,19 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
             raise unknown("dataset", pattern, {entry.task.dataset for entry in entries})
     if datasets:
         entries = [e for e in entries if any(fnmatch(e.task.dataset, pattern) for pattern in datasets)]
-        waiting = [run for run in waiting if any(fnmatch(run.config().dataset, pattern) for pattern in datasets)]
+        unevaluated = [
+            run for run in unevaluated if any(fnmatch(run.config().dataset, pattern) for pattern in datasets)
+        ]
     if methods:
         every = tuple(dict.fromkeys(entry.method for entry in entries))
         wanted = {find_method(every, name) for name in methods}
-        entries, waiting = [entry for entry in entries if entry.method in wanted], []
+        entries, unevaluated = [entry for entry in entries if entry.method in wanted], []
     tasks = dict.fromkeys(entry.task for entry in entries)
     ordered = sorted({entry.method for entry in entries}, key=method_order)
-    return Results(roots, tuple(tasks), tuple(ordered), {(e.task, e.method): e for e in entries}, tuple(waiting))
+    return Results(roots, tuple(tasks), tuple(ordered), {(e.task, e.method): e for e in entries}, tuple(unevaluated))
 
 
-def with_several_codes(runs: Iterable[tuple[Key, Trained]]) -> list[Key]:
+def keys_with_mixed_code(runs: Iterable[tuple[Key, EvaluatedRun]]) -> list[Key]:
     """Return the keys whose runs were trained by different code of the algorithm, as far as their config.json says."""
     codes: dict[Key, set[tuple[tuple[str, str], ...]]] = {}
     for key, trained in runs:
@@ -263,10 +265,10 @@ def with_several_codes(runs: Iterable[tuple[Key, Trained]]) -> list[Key]:
 
 def mixed_code(entries: Iterable[Entry]) -> list[tuple[Task, str]]:
     """Return the tasks and algorithms whose runs, of all variants, were trained by different code."""
-    return with_several_codes(((entry.task, entry.method.algorithm), run) for entry in entries for run in entry.runs)
+    return keys_with_mixed_code(((entry.task, entry.method.algorithm), run) for entry in entries for run in entry.runs)
 
 
-def window_words(runs: Iterable[Trained]) -> str:
+def window_text(runs: Iterable[EvaluatedRun]) -> str:
     """Return which evaluations are behind the scores of runs: `10 evaluations, steps 5,000 to 50,000`."""
     windows = [trained.window for trained in runs]
     counts, ends = {len(steps) for steps in windows}, {end for steps in windows for end in (steps[0], steps[-1])}
@@ -281,25 +283,25 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
     Raises:
         OffbenchError: one is there twice, two do not compare, or none but damaged ones is evaluated.
     """
-    groups: dict[tuple[str, str, str, str], list[Trained]] = {}
-    waiting = []
+    groups: dict[tuple[str, str, str, str], list[EvaluatedRun]] = {}
+    unevaluated = []
     damaged: list[OffbenchError] = []
     for run in runs:
         try:
-            trained = Trained(run, run.config(), run.evaluations(), run.losses())
+            trained = EvaluatedRun(run, run.config(), run.evaluations(), run.losses())
         except OffbenchError as error:
             damaged.append(error)
             continue
         except OSError as error:
-            words = f"cannot read {run.folder}: {error.strerror}; {READ_REMEDIES.get(error.errno, 'try again')}"
-            damaged.append(OffbenchError(words))
+            message = f"cannot read {run.folder}: {error.strerror}; {READ_REMEDIES.get(error.errno, 'try again')}"
+            damaged.append(OffbenchError(message))
             continue
         if trained.evaluations:
             config = trained.config
             key = (config.dataset, config.dataset_sha256, config.algorithm, config.variant)
             groups.setdefault(key, []).append(trained)
         else:
-            waiting.append(run)
+            unevaluated.append(run)
     if damaged and not groups:
         raise damaged[0]
     for reason in damaged:
@@ -315,12 +317,12 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
         _check_seeds(group)
         entries.append(Entry(tasks[dataset, content], methods[algorithm, variant], tuple(group)))
     entries.sort(key=lambda entry: (_task_order(entry.task), method_order(entry.method)))
-    return entries, waiting
+    return entries, unevaluated
 
 
-def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[Trained]]) -> dict[tuple[str, str], Task]:
+def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[EvaluatedRun]]) -> dict[tuple[str, str], Task]:
     """Return the task of each (dataset, content), with a reference that all its runs have."""
-    runs: dict[tuple[str, str], list[Trained]] = {}
+    runs: dict[tuple[str, str], list[EvaluatedRun]] = {}
     for key, group in groups.items():
         runs.setdefault(key[:2], []).extend(group)
     ids = [dataset for dataset, _ in runs]
@@ -334,7 +336,7 @@ def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[Trained]]) -> dic
     return tasks
 
 
-def _check_evaluated_alike(one: Trained, other: Trained) -> None:
+def _check_evaluated_alike(one: EvaluatedRun, other: EvaluatedRun) -> None:
     """Refuse two runs on the same data whose returns, or scores, do not compare."""
     a, b = one.config, other.config
     if a.env_spec and b.env_spec and not same_environment(a.env_spec, b.env_spec):
@@ -349,7 +351,7 @@ def _check_evaluated_alike(one: Trained, other: Trained) -> None:
     )
 
 
-def _check_seeds(runs: Sequence[Trained]) -> None:
+def _check_seeds(runs: Sequence[EvaluatedRun]) -> None:
     for one, other in itertools.pairwise(runs):
         if one.seed == other.seed:
             raise OffbenchError(

@@ -2,7 +2,7 @@
 Statistical Precipice" (NeurIPS 2021): interquartile mean, probability of improvement, performance profiles, and
 stratified bootstrap intervals. docs/statistics.md has the formulas.
 
-    scores = {"hopper-medium-v0": [51.2, 48.0, 55.1], "hopper-random-v0": [9.1, 8.7, 9.9]}    task: one score a seed
+    scores = {"hopper-medium-v0": [51.2, 48.0, 55.1], "hopper-random-v0": [9.1, 8.7, 9.9]}    task: one score per seed
 
 A task is a stratum: its seeds are resampled among themselves, so every resample has all tasks. The generator is
 fixed: the same scores have the same interval. A task with a single seed shows no spread, so no interval is given.
@@ -56,7 +56,7 @@ def iqm(scores: Scores, resamples: int = RESAMPLES) -> Estimate:
 
     A quarter is rounded down to whole runs: three runs or fewer lose none, and their IQM is their mean.
     """
-    return _estimate([scores], lambda drawn: _trimmed(drawn[0]), resamples)
+    return _estimate([scores], lambda resampled: _trimmed_mean(resampled[0]), resamples)
 
 
 def improvement(a: Scores, b: Scores) -> Estimate:
@@ -69,14 +69,14 @@ def improvement(a: Scores, b: Scores) -> Estimate:
     """
     tasks = common(a, b)
     pair = [{task: scores[task] for task in tasks} for scores in (a, b)]
-    return _estimate(pair, lambda drawn: _above(*drawn), RESAMPLES)
+    return _estimate(pair, lambda resampled: _share_above(*resampled), RESAMPLES)
 
 
 def profile(scores: Scores, taus: Sequence[float]) -> list[Estimate]:
     """Return the performance profile: for each tau the fraction of runs that score above it."""
-    drawn = _draw(scores, CURVE_RESAMPLES)
-    fractions = [_fraction(_exact(scores), tau)[0] for tau in taus]
-    spread = [_fraction(drawn, tau) if drawn else None for tau in taus]
+    resampled = _resample(scores, CURVE_RESAMPLES)
+    fractions = [_fraction(_observed(scores), tau)[0] for tau in taus]
+    spread = [_fraction(resampled, tau) if resampled else None for tau in taus]
     return [_with_interval(float(value), values) for value, values in zip(fractions, spread, strict=True)]
 
 
@@ -112,7 +112,7 @@ def paired(differences: Scores) -> Paired:
     every = np.concatenate([np.asarray(values, np.float64) for values in differences.values()])
     spread = float(every.std(ddof=1)) if len(every) > 1 else 0.0
     return Paired(
-        _estimate([differences], lambda drawn: _mean_of_means(drawn[0]), RESAMPLES),
+        _estimate([differences], lambda resampled: _mean_of_means(resampled[0]), RESAMPLES),
         float(every.mean()) / spread if spread > 1e-12 * np.abs(every).max() else None,  # less is rounding
         _sign_flip(differences),
         len(every),
@@ -141,25 +141,25 @@ def _sign_flip(differences: Scores) -> float:
     return (hits + 1) / (RESAMPLES + 1)  # the observed pattern is one of them
 
 
-def _exact(scores: Scores) -> list[Array]:
-    """Return each task's scores as the one row [1, seeds] that was seen."""
+def _observed(scores: Scores) -> list[Array]:
+    """Return each task's observed scores as an array [1, seeds]."""
     return [np.asarray(values, np.float64)[None] for values in scores.values()]
 
 
-def _draw(scores: Scores, resamples: int, stream: int = 0) -> list[Array] | None:
+def _resample(scores: Scores, resamples: int, stream: int = 0) -> list[Array] | None:
     """Return resamples of each task's seeds [resamples, seeds]; None if a task has a single seed."""
     rng = generator(0, Purpose.BOOTSTRAP, stream)
     if min(len(values) for values in scores.values()) < 2:
         return None
-    rows = (row[0] for row in _exact(scores))
+    rows = (row[0] for row in _observed(scores))
     return [row[rng.integers(len(row), size=(resamples, len(row)))] for row in rows]
 
 
 def _estimate(groups: Sequence[Scores], statistic: Callable[[list[list[Array]]], Array], resamples: int) -> Estimate:
     """Return a statistic of groups of runs, each resampled independently of the others."""
-    value = float(statistic([_exact(scores) for scores in groups])[0])
-    drawn = [_draw(scores, resamples, stream) for stream, scores in enumerate(groups)]
-    complete = [parts for parts in drawn if parts is not None]
+    value = float(statistic([_observed(scores) for scores in groups])[0])
+    resampled = [_resample(scores, resamples, stream) for stream, scores in enumerate(groups)]
+    complete = [parts for parts in resampled if parts is not None]
     return _with_interval(value, statistic(complete) if len(complete) == len(groups) else None)
 
 
@@ -170,13 +170,13 @@ def _with_interval(value: float, resampled: Array | None) -> Estimate:
     return Estimate(value, float(low), float(high))
 
 
-def _trimmed(tasks: list[Array]) -> Array:
+def _trimmed_mean(tasks: list[Array]) -> Array:
     from scipy import stats  # takes a second to import
 
     return np.asarray(stats.trim_mean(np.concatenate(tasks, 1), 0.25, axis=1))
 
 
-def _above(a: list[Array], b: list[Array]) -> Array:
+def _share_above(a: list[Array], b: list[Array]) -> Array:
     per_task = []
     for mine, other in zip(a, b, strict=True):
         left, right = mine[:, :, None], other[:, None, :]

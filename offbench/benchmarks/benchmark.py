@@ -71,7 +71,7 @@ def benchmark(
         shard: (i, n): the i-th of n shares of the runs, for machines with a shared file system.
         executor: this machine (default), or a cluster (`offbench.benchmarks.ray_executor.RayExecutor`).
         command: what the user typed, for each run's config.json.
-        say: takes the plan, line by line.
+        say: receives each line of the plan.
 
     Returns:
         Whether the grid (of this shard) is finished.
@@ -120,5 +120,5 @@ def shard_of(bench: Benchmark, shard: tuple[int, int]) -> list[RunSpec]:
     for variant in bench.variants:
         share = np.array_split(np.arange(len(variant)), count)[(index - offset) % count]
         specs += [variant[i] for i in share]
-        offset += len(variant)  # the first few shares have one run more: for the next variant, those after them
+        offset += len(variant)  # the first shares may have one run more; the next variant starts after them
     return specs

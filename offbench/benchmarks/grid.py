@@ -1,7 +1,7 @@
 """Grids: which algorithms, settings and seeds on which datasets, for how long, in one TOML file.
 
 datasets = ["hopper-medium-v0", {id = "mine-v0", env = "./my-env.toml", level = "medium", steps = 20_000}]
-seeds = 5                          # that many, or a list
+seeds = 5                          # a count, or a list
 steps = 1_000_000                  # with eval_every and eval_episodes as in `offbench train`
 [[algorithms]]
 name = "bdb"                       # or "./my_algo.py:ReBRAC"
@@ -24,8 +24,8 @@ from pathlib import Path
 
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import JsonObject, damage, read_text
-from offbench.common.settings import build, shown
-from offbench.common.text import LARGEST, MOST_SEEDS
+from offbench.common.settings import build, short_repr
+from offbench.common.text import LARGEST_INTEGER, MOST_SEEDS
 from offbench.data import minari_store
 from offbench.data.levels import parse_level, recipe_and_level
 from offbench.envs.recipes import load_recipe
@@ -55,7 +55,7 @@ class Entry:
     """An algorithm of a grid with its settings (each value of a list is a variant) and its times.
 
     Attributes:
-        label: the name in tables of the one variant that the settings are; empty for the usual name.
+        label: the name in tables, if the settings are one variant; empty for the usual name.
         datasets: the ids of those that it trains on.
     """
 
@@ -121,9 +121,11 @@ def _times(values: JsonObject, default: Times, where: str) -> Times:
     seeds = merged.pop("seeds")
     if isinstance(seeds, int) and not isinstance(seeds, bool) and 0 < seeds <= MOST_SEEDS:
         seeds = range(seeds)
-    bad = not isinstance(seeds, Sequence) or any(type(s) is not int or not 0 <= s <= LARGEST for s in seeds)
+    bad = not isinstance(seeds, Sequence) or any(type(s) is not int or not 0 <= s <= LARGEST_INTEGER for s in seeds)
     if bad or len(set(seeds)) != len(seeds) or not len(seeds):
-        raise OffbenchError(f"{where}: seeds must be a count or a list of different whole numbers, not {shown(seeds)}")
+        raise OffbenchError(
+            f"{where}: seeds must be a count or a list of different whole numbers, not {short_repr(seeds)}"
+        )
     return build(Times, merged | {"seeds": tuple(seeds)}, where)
 
 
@@ -137,7 +139,7 @@ def _source(value: object, folder: Path, where: str) -> Source:
         env = str(beside) if source.env.endswith(".toml") and beside.is_file() else source.env
         return dataclasses.replace(source, env=env, level=source.level or ("medium" if env else ""))
     if not isinstance(value, str):
-        raise OffbenchError(f"{where}: datasets must be ids or tables, not {shown(value)}")
+        raise OffbenchError(f"{where}: datasets must be ids or tables, not {short_repr(value)}")
     env, level = recipe_and_level(minari_store.check_id(value))
     if env and value.rpartition("-v")[2] != str(load_recipe(env).version):
         return Source(value)  # of another version, such as one of D4RL's: it can be used but not recorded
@@ -152,12 +154,14 @@ def _entry(value: object, times: Times, ids: Sequence[str], folder: Path, where:
     changed = _times({key: item for key, item in value.items() if key in own}, times, entry)
     label = value.get("label", "")
     if not isinstance(label, str) or len(label) > LONGEST_LABEL or not label.isprintable():
-        raise OffbenchError(f"{entry}: label must be a line of at most {LONGEST_LABEL} characters, not {shown(label)}")
+        raise OffbenchError(
+            f"{entry}: label must be a line of at most {LONGEST_LABEL} characters, not {short_repr(label)}"
+        )
     patterns = value.get("datasets", ["*"])
     for pattern in _list(patterns, "datasets", entry):
         if not isinstance(pattern, str) or not fnmatch.filter(ids, pattern):
             raise OffbenchError(
-                f"{entry}: no dataset of this grid matches {shown(pattern)}; there are {', '.join(ids)}"
+                f"{entry}: no dataset of this grid matches {short_repr(pattern)}; there are {', '.join(ids)}"
             )
     datasets = tuple(name for name in ids if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns))
     settings = {key: item for key, item in value.items() if key not in own | {"name", "label", "datasets"}}

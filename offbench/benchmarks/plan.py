@@ -1,4 +1,4 @@
-"""Planning: a grid on a machine, the runs that are left of it, and what they cost there."""
+"""Planning: the unfinished runs of a grid, and the time and disk space that they need on a machine."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def prepare(
 
 
 class Plan:
-    """The lines of a plan: what a grid is, and what the rest of it costs here. A finished grid is not measured.
+    """The lines of a plan: a grid's size, and the cost of its unfinished runs here. A finished grid is not measured.
 
     Attributes:
         update_seconds: seconds per update of one run, evaluations included, of each algorithm in the lines so far.
@@ -125,26 +125,26 @@ class Plan:
         if not any(left):
             return
         env_specs = {source.env: load_recipe(source.env).env_spec() for source in bench.grid.datasets if source.env}
-        given = bench.variants[0][0].env_spec
-        env_specs = {"": given} if given else env_specs or {"": _recorded_env_spec(bench.grid.datasets[0])}
+        chosen = bench.variants[0][0].env_spec
+        env_specs = {"": chosen} if chosen else env_specs or {"": _recorded_env_spec(bench.grid.datasets[0])}
         env_spec = next(iter(env_specs.values()))  # for the shapes, which differ little
-        play = float(np.mean([step_seconds(text) for text in env_specs.values()]))
+        step_time = float(np.mean([step_seconds(text) for text in env_specs.values()]))
         self._seconds = self._disk = self._products = 0.0  # of the lines so far
         to_train = [specs for specs in left if specs]
         widths = max(len(_name(specs[0])) for specs in to_train), max(len(f"{specs[0].steps:,}") for specs in to_train)
         for specs in to_train:
-            yield self._variant(specs, env_spec, play, *widths)
+            yield self._variant(specs, env_spec, step_time, *widths)
         if missing := bench.missing():
-            yield self._recording(missing, env_spec, play)
+            yield self._recording(missing, env_spec, step_time)
         yield from self._total()
 
-    def _variant(self, specs: Sequence[RunSpec], env_spec: str, play: float, name_width: int, width: int) -> str:
+    def _variant(self, specs: Sequence[RunSpec], env_spec: str, step_time: float, name_width: int, width: int) -> str:
         spec, machine, runs = specs[0], self.bench.machine, len(specs)
         rate = measure(spec, env_spec, machine.device)
-        each = _cost(spec, rate, play, env_spec)
-        self.update_seconds[spec.algorithm] = each / spec.steps
+        run_seconds = _cost(spec, rate, step_time, env_spec)
+        self.update_seconds[spec.algorithm] = run_seconds / spec.steps
         left = sum(1 - spec.run.newest_checkpoint() / spec.steps for spec in specs)  # of a whole run each
-        cost = left * each / machine.processes
+        cost = left * run_seconds / machine.processes
         self._seconds += cost
         self._disk += 2 * rate.bytes_per_run * runs
         if machine.device == "cpu":
@@ -154,9 +154,9 @@ class Plan:
             f"at {rate.updates:>5,.0f}/s: {duration(cost)}"
         )
 
-    def _recording(self, missing: Sequence[Source], spec: str, play: float) -> str:
+    def _recording(self, missing: Sequence[Source], spec: str, step_time: float) -> str:
         steps = sum(_size(source) for source in missing)
-        self._seconds += steps * play / self.bench.machine.workers
+        self._seconds += steps * step_time / self.bench.machine.workers
         self._disk += steps * _bytes_per_step(spec)
         return f"  to record first: {', '.join(source.id for source in missing)} ({steps:,} transitions)"
 
@@ -173,11 +173,11 @@ class Plan:
             )
 
 
-def _cost(spec: RunSpec, rate: Rate, play: float, env_spec: str) -> float:
+def _cost(spec: RunSpec, rate: Rate, step_time: float, env_spec: str) -> float:
     """Return the seconds of one run: its updates and its evaluations, full-length episodes assumed."""
     length = time_limit(parse_spec(env_spec)) or 1000
     episodes = -(-spec.steps // spec.eval_every) * spec.eval_episodes
-    return spec.steps / rate.updates + episodes * length * play
+    return spec.steps / rate.updates + episodes * length * step_time
 
 
 def _recorded_env_spec(source: Source) -> str:
@@ -197,7 +197,7 @@ def _size(source: Source) -> int:
 
 
 def _bytes_per_step(spec: str) -> int:
-    """Return what a transition takes on disk: in the dataset (float64 observations) and in the cache (float32)."""
+    """Return the bytes of a transition on disk: in the dataset (float64 observations) and in the cache (float32)."""
     observations, actions = spaces_of(make_env(spec), "the environment")
     return 12 * observations.shape[0] + 8 * actions.shape[0] + 34
 

@@ -5,8 +5,8 @@
     FileServer      an actor on the driver's node: reads and writes files there for nodes that do not share its disk
 
 A node that can read the driver's token on its own disk works in the driver's folders. Any other node downloads the
-datasets and checkpoints from the file server, trains in a folder of its own and uploads the run folders. A lost node
-costs what it had not uploaded: Ray runs its tasks again, and a run's bits do not depend on where it resumes.
+datasets and checkpoints from the file server, trains in a folder of its own and uploads the run folders. If a node
+is lost, Ray runs its tasks again from what it has uploaded; a run's bits do not depend on where it resumes.
 
 An algorithm of the user's own is sent with each task as the code that the driver imported, so that all nodes run that
 code, whatever files they have. Packages must be installed on each node.
@@ -34,7 +34,7 @@ from offbench.common.processes import environment
 from offbench.data import minari_store
 from offbench.training.grouping import by_common_step
 from offbench.training.jobs import JobProgress, raise_first, train_job
-from offbench.training.registry import own_algorithm, use
+from offbench.training.registry import own_algorithm, register
 from offbench.training.source_code import own_modules
 from offbench.training.spec import Job, RunSpec
 
@@ -104,7 +104,7 @@ class RayExecutor:
         with JobProgress(jobs) as progress, _token(common) as token:
             while waiting or active:
                 for index in waiting:
-                    if not jobs[index].is_over:
+                    if not jobs[index].deadline_passed:
                         active[self._start(jobs[index], index, token)] = index
                 waiting = []
                 for ref in self.ray.wait(list(active), num_returns=1, timeout=POLL)[0] if active else ():
@@ -175,11 +175,11 @@ class FileServer:
     def replace(self, folder: str, files: Files) -> None:
         """Write a dataset's folder, whole or not at all."""
         target = Path(folder)
-        aside = target.with_name(f".offbench-{target.name}.upload")
-        shutil.rmtree(aside, ignore_errors=True)
-        write_folder(aside, files)
+        temporary = target.with_name(f".offbench-{target.name}.upload")
+        shutil.rmtree(temporary, ignore_errors=True)
+        write_folder(temporary, files)
         if not target.exists():
-            aside.replace(target)
+            temporary.replace(target)
 
     def report(self, index: int, step: int, note: str) -> None:
         """Keep the latest step and note of a job."""
@@ -241,10 +241,10 @@ def _train(
     """A task: train a job for a slice of time, which begins now, however long the task has waited.
 
     Args:
-        own: the algorithm's class if no package has it.
+        own: the algorithm's class, if no installed package has it.
     """
     if own is not None:
-        use(own)
+        register(own)
     slice_end = time.time() + seconds
     job = replace(job, deadline=slice_end if job.deadline is None else min(job.deadline, slice_end))
 

@@ -1,4 +1,4 @@
-"""What training costs here: half a second of each algorithm on random data, and of the environment."""
+"""The speed of training and of environment steps on this machine, each measured for half a second."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from offbench.algorithm.mlp import products_by
 from offbench.data.transitions import Transitions
 from offbench.envs.environments import make_env, spaces_of
 from offbench.rollouts.rollouts import reset, step
-from offbench.training.captured_update import RECORDED
+from offbench.training.captured_update import RECORDED_UPDATES
 from offbench.training.devices import arithmetic
 from offbench.training.grouping import stack_size
 from offbench.training.registry import load_algorithm
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 SECONDS = 0.5  # that a measurement lasts at least
 ROWS = 4096  # random transitions
 ENV_STEPS = 2000
-COUNTED = 4  # updates whose operations are counted: of every kind that takes turns
+COUNTED = 4  # updates whose operations are counted: enough to include every phase of an alternating update
 
 
 @dataclass(frozen=True)
@@ -51,37 +51,37 @@ def measure(spec: RunSpec, env_spec: str, device: str) -> Rate:
     """
     with arithmetic(device, spec.precision):
         runs = 1 if device == "cpu" else stack_size(spec, random_data(env_spec), device)
-        learning = random_stack(load_algorithm(spec.algorithm), [spec.config] * runs, env_spec, device)
-        wanted = 2 * RECORDED
+        stack = random_stack(load_algorithm(spec.algorithm), [spec.config] * runs, env_spec, device)
+        updates = 2 * RECORDED_UPDATES
         while True:
-            began, first = time.perf_counter(), learning.step
-            for _ in learning.train(first + wanted):
+            began, first = time.perf_counter(), stack.step
+            for _ in stack.train(first + updates):
                 pass
-            learning.logged()  # waits for the device
+            stack.logged()  # waits for the device
             spent = time.perf_counter() - began
             if spent >= SECONDS and first:
                 break
-            wanted = max(2, min(10 * wanted, round(1.2 * SECONDS * wanted / spent)))
-    size = sum(t.numel() * t.element_size() for t in learning.run_tensors(0).values())
-    return Rate(wanted * runs / spent, size)
+            updates = max(2, min(10 * updates, round(1.2 * SECONDS * updates / spent)))
+    size = sum(t.numel() * t.element_size() for t in stack.run_tensors(0).values())
+    return Rate(updates * runs / spent, size)
 
 
 def operations(spec: RunSpec, env_spec: str) -> float:
     """Return the floating-point operations of an update's matrix products, as PyTorch counts them (2 m n k each)."""
     from torch.utils.flop_counter import FlopCounterMode
 
-    learning = random_stack(load_algorithm(spec.algorithm), [spec.config], env_spec)
-    learning.program.eager = True
-    for _ in learning.train(2 * RECORDED):  # past whatever happens only once
+    stack = random_stack(load_algorithm(spec.algorithm), [spec.config], env_spec)
+    stack.program.eager = True
+    for _ in stack.train(2 * RECORDED_UPDATES):  # past work that is done only once
         pass
     with products_by("pytorch"), FlopCounterMode(display=False) as counter:
-        for _ in learning.train(2 * RECORDED + COUNTED):
+        for _ in stack.train(2 * RECORDED_UPDATES + COUNTED):
             pass
     return float(counter.get_total_flops()) / COUNTED
 
 
 def random_stack(
-    kind: type[Algorithm],
+    algorithm: type[Algorithm],
     configs: Sequence[DataclassInstance],
     env_spec: str,
     device: str = "cpu",
@@ -93,7 +93,7 @@ def random_stack(
         RunSpec("", config, "random", seed, steps=1, eval_every=1, eval_episodes=1, folder=Path())
         for seed, config in enumerate(configs)
     ]
-    return Stack(kind, specs, {"random": random_data(env_spec, rows)}, device)
+    return Stack(algorithm, specs, {"random": random_data(env_spec, rows)}, device)
 
 
 def random_data(env_spec: str, rows: int = ROWS) -> Transitions:

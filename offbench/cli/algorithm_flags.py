@@ -6,7 +6,7 @@ import argparse
 import functools
 from collections.abc import Iterator, Mapping
 
-from offbench.cli.arguments import Parser, completed
+from offbench.cli.arguments import Parser, complete_with
 from offbench.common.settings import Field, fields
 
 OPTIMIZATION = ("batch_size", "discount", "tau", "policy_freq", "normalize")  # settings that every method has
@@ -14,9 +14,9 @@ OPTIMIZATION = ("batch_size", "discount", "tau", "policy_freq", "normalize")  # 
 
 def add_settings(parser: Parser, algorithm: str) -> type:
     """Add an algorithm's own settings, in groups. Returns its Config."""
-    from offbench.training.registry import load_algorithm, use
+    from offbench.training.registry import load_algorithm, register
 
-    config = load_algorithm(use(algorithm)).Config
+    config = load_algorithm(register(algorithm)).Config
     titles = {
         "method": f"settings of {algorithm}",
         "optimization": f"optimization of {algorithm}",
@@ -24,13 +24,13 @@ def add_settings(parser: Parser, algorithm: str) -> type:
     }
     groups = {}
     members = fields(config)
-    for kind, title in titles.items():
+    for group, title in titles.items():
         for name, field in members.items():
-            if _kind(name, field) != kind:
+            if _help_group(name, field) != group:
                 continue
-            if kind not in groups:
-                groups[kind] = parser.add_argument_group(title)
-            action = groups[kind].add_argument(
+            if group not in groups:
+                groups[group] = parser.add_argument_group(title)
+            action = groups[group].add_argument(
                 f"--{name.replace('_', '-')}",
                 dest=f"setting_{name}",
                 nargs="+",
@@ -38,11 +38,11 @@ def add_settings(parser: Parser, algorithm: str) -> type:
                 default=argparse.SUPPRESS,
                 help=_help(field).replace("%", "%%"),
             )
-            completed(action, functools.partial(list, field.metadata.get("choices") or ()))
+            complete_with(action, functools.partial(list, field.metadata.get("choices") or ()))
     return config
 
 
-def _kind(name: str, field: Field) -> str:
+def _help_group(name: str, field: Field) -> str:
     """Return the group of a setting in the help: `method`, `optimization` or `ours`."""
     if field.metadata.get("help", "").startswith("ours"):
         return "ours"
@@ -50,16 +50,15 @@ def _kind(name: str, field: Field) -> str:
 
 
 def _help(field: Field) -> str:
-    """Return a setting's help, with the words that it may be and its default."""
-    words = " | ".join(field.metadata.get("choices") or ())
+    """Return a setting's help with its choices and its default."""
+    choices = " | ".join(field.metadata.get("choices") or ())
     default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else str(field.default)
-    return (
-        f"{field.metadata.get('help', '').removeprefix('ours: ')} ({words}{'; ' if words else ''}default: {default})"
-    )
+    text = field.metadata.get("help", "").removeprefix("ours: ")
+    return f"{text} ({choices}{'; ' if choices else ''}default: {default})"
 
 
 def notices(config: type, settings: Mapping[str, object]) -> Iterator[str]:
-    """Return what a user should know of the values of settings, as the algorithm's fields have it."""
+    """Yield the notes that the algorithm's Config declares for these values of settings."""
     for name, field in fields(config).items():
         values = settings.get(name, [field.default])
         for value, text in field.metadata.get("notes", {}).items():

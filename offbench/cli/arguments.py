@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 from offbench.common.errors import OffbenchError, nearest
 from offbench.common.terminal import is_terminal
-from offbench.common.text import LARGEST, MOST_SEEDS, whole_number
+from offbench.common.text import LARGEST_INTEGER, MOST_SEEDS, whole_number
 
 HELP_COLUMN = 28  # where the help of an argument begins, at the latest, on a terminal of 80 columns
 
@@ -22,10 +22,10 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line and exit code 2, and whose help is colored on a terminal.
 
     Attributes:
-        asked: the command whose `--help` an error names, where it is not the parser's own.
+        help_command: the command whose `--help` an error names, where it is not the parser's own.
     """
 
-    asked = ""
+    help_command = ""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(formatter_class=_Formatter, **kwargs)
@@ -34,7 +34,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise the error that `main` prints."""
-        raise OffbenchError(f"{message} (see `{self.asked or self.prog} --help`)")
+        raise OffbenchError(f"{message} (see `{self.help_command or self.prog} --help`)")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Report unknown flags before missing arguments, by the parser that has the flags."""
@@ -71,7 +71,7 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
     def add_usage(
         self, usage: str | None, actions: Iterable[argparse.Action], groups: Any, prefix: str | None = None
     ) -> None:
-        """Show what a command needs; its options are listed below."""
+        """Show only required arguments in the usage line; the options are listed below it."""
         if usage is None:
             needed = sorted(
                 (a for a in actions if not a.option_strings or a.required), key=lambda a: bool(a.option_strings)
@@ -87,7 +87,7 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
         return super()._format_args(action, default_metavar)
 
     def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
-        if action.type in (whole, natural):
+        if action.type in (positive_int, non_negative_int):
             return "N"
         return "X" if action.type is number else super()._get_default_metavar_for_optional(action)
 
@@ -97,7 +97,7 @@ class Command:
     """A command.
 
     Attributes:
-        add_arguments: adds its arguments to a parser; takes the words after the command, too.
+        add_arguments: adds its arguments to a parser, given also the command line after the command.
         examples: command lines without `offbench`.
     """
 
@@ -111,8 +111,8 @@ class Command:
         return f"example{'s' if len(self.examples) > 1 else ''}:\n{lines}"
 
 
-def completed(action: argparse.Action, words: Callable[[], Iterable[str]]) -> None:
-    """Let shell completion offer words for an argument, looked up when asked."""
+def complete_with(action: argparse.Action, words: Callable[[], Iterable[str]]) -> None:
+    """Set the words that shell completion offers for an argument; `words` is called when they are needed."""
     action.completer = lambda **_: list(words())  # type: ignore[attr-defined]
 
 
@@ -144,24 +144,24 @@ def methods() -> list[str]:
     return [method.label for method in read_results("runs").methods]
 
 
-def trust(parser: Parser) -> None:
-    """Add --trust, which `main` takes."""
+def add_trust_flag(parser: Parser) -> None:
+    """Add --trust, which `main` handles."""
     parser.add_argument(
         "--trust", action="store_true", help="trust the files: import and run any environment that they name"
     )
 
 
-def whole(text: str) -> int:
+def positive_int(text: str) -> int:
     """Return a whole number from 1 (1e6 and 1_000_000 are understood)."""
     return _whole(text, 1)
 
 
 def auto(text: str) -> int | str:
     """Return "auto" or a whole number from 1."""
-    return text if text == "auto" else whole(text)
+    return text if text == "auto" else positive_int(text)
 
 
-def natural(text: str) -> int:
+def non_negative_int(text: str) -> int:
     """Return a whole number from 0."""
     return _whole(text, 0)
 
@@ -173,19 +173,19 @@ def _whole(text: str, least: int) -> int:
         value = least - 1
     if value < least:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}")
-    if value > LARGEST:
+    if value > LARGEST_INTEGER:
         raise argparse.ArgumentTypeError(f"{text!r:.60} is too large a number")
     return value
 
 
-def share(text: str) -> tuple[int, int]:
+def shard(text: str) -> tuple[int, int]:
     """Return (i, n) of `i/n`."""
     first, slash, last = text.partition("/")
     if not slash:
         raise argparse.ArgumentTypeError(f"{text!r} is not a share such as 0/4")
-    if natural(first) >= whole(last):
+    if non_negative_int(first) >= positive_int(last):
         raise argparse.ArgumentTypeError(f"a shard is i/n with i from 0 to n - 1, not {text}")
-    return natural(first), whole(last)
+    return non_negative_int(first), positive_int(last)
 
 
 def number(text: str) -> float:
@@ -200,7 +200,11 @@ def seed_list(text: str) -> list[int]:
     """Return the seeds of `3`, `0,1,2` or `0:5` (the end is left out, as in Python)."""
     first, colon, last = text.partition(":")
     try:
-        seeds = range(natural(first), natural(last)) if colon else [natural(part) for part in text.split(",")]
+        seeds = (
+            range(non_negative_int(first), non_negative_int(last))
+            if colon
+            else [non_negative_int(part) for part in text.split(",")]
+        )
     except argparse.ArgumentTypeError as error:
         raise argparse.ArgumentTypeError(f"{error}; seeds are 3, 0,1,2 or 0:4 (0 to 3)") from None
     if not seeds:

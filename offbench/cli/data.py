@@ -7,8 +7,17 @@ from json import dumps
 from typing import Any
 
 import offbench
-from offbench.cli.arguments import Parser, completed, levels, local_datasets, natural, recipes, trust, whole
-from offbench.common.terminal import hint, print_lines, print_table, say
+from offbench.cli.arguments import (
+    Parser,
+    add_trust_flag,
+    complete_with,
+    levels,
+    local_datasets,
+    non_negative_int,
+    positive_int,
+    recipes,
+)
+from offbench.common.terminal import hint, print_line, print_lines, print_table
 
 
 def collect_arguments(parser: Parser, _: list[str]) -> None:
@@ -19,7 +28,7 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
         default="medium",
         help="a level, or a fraction of the expert's normalized return such as 0.6 (default: medium)",
     )
-    completed(level, levels)
+    complete_with(level, levels)
     parser.add_argument("--mix", metavar="LEVEL:SHARE,...", help="a mix of levels, e.g. random:0.5,expert:0.5")
     parser.add_argument(
         "--policy",
@@ -27,9 +36,9 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
         help="record this policy instead of a level: agent.zip (SB3), a run, a policy file, or module:function",
     )
     parser.add_argument("--name", help="with --policy: the level in the dataset's id (default: the policy's name)")
-    parser.add_argument("--steps", type=whole, help="transitions (default: the whole level, usually 1,000,000)")
-    parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
-    parser.add_argument("--workers", type=whole, help="recording processes (default: one per core)")
+    parser.add_argument("--steps", type=positive_int, help="transitions (default: the whole level, usually 1,000,000)")
+    parser.add_argument("--seed", type=non_negative_int, default=0, help="seed of the episodes (default: 0)")
+    parser.add_argument("--workers", type=positive_int, help="recording processes (default: one per core)")
     parser.add_argument("--id", dest="dataset_id", metavar="ID", help="the dataset's id (default: <env>-<level>-v0)")
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset with the same id")
     parser.add_argument(
@@ -51,9 +60,9 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
 def behaviour_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `behaviour`."""
     _env(parser, "a shipped environment or a recipe file")
-    parser.add_argument("--seed", type=natural, default=0, help="seed of the training (default: 0)")
-    parser.add_argument("--steps", type=whole, help="environment steps (default: the recipe's)")
-    parser.add_argument("--workers", type=whole, help="processes that evaluate rungs (default: one per core)")
+    parser.add_argument("--seed", type=non_negative_int, default=0, help="seed of the training (default: 0)")
+    parser.add_argument("--steps", type=positive_int, help="environment steps (default: the recipe's)")
+    parser.add_argument("--workers", type=positive_int, help="processes that evaluate rungs (default: one per core)")
     parser.add_argument("--out", metavar="DIR", help="folder of the ladder (default: below --behaviour-dir)")
     _behaviour_dir(parser)
 
@@ -73,11 +82,11 @@ def behaviour_arguments(parser: Parser, _: list[str]) -> None:
 
 
 def _env(parser: Parser, text: str) -> None:
-    completed(parser.add_argument("env", metavar="ENV", help=text), recipes)
+    complete_with(parser.add_argument("env", metavar="ENV", help=text), recipes)
 
 
 def _dataset(parser: Parser) -> None:
-    completed(parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset"), local_datasets)
+    complete_with(parser.add_argument("dataset_id", metavar="ID", help="a local Minari dataset"), local_datasets)
 
 
 def _behaviour_dir(parser: Parser) -> None:
@@ -101,7 +110,7 @@ def list_arguments(parser: Parser, _: list[str]) -> None:
             print(dumps(contents, indent=1))
             return
         for i, (title, header, rows) in enumerate(sections(contents)):
-            say(f"\n{title}" if i else title, "bold")
+            print_line(f"\n{title}" if i else title, "bold")
             if header:
                 print_table(header, rows, names=2 if title in ("environments", "runs") else 1, group=title == "runs")
             else:
@@ -132,7 +141,7 @@ def card_arguments(parser: Parser, _: list[str]) -> None:
         metavar="ENV_OR_ID",
         help="a shipped environment or a recipe file whose five levels are recorded; with --huggingface a dataset",
     )
-    completed(about, lambda: [*recipes(), *local_datasets()])
+    complete_with(about, lambda: [*recipes(), *local_datasets()])
     parser.add_argument(
         "--huggingface", action="store_true", help="write a dataset's card for the Hugging Face Hub instead"
     )
@@ -157,10 +166,12 @@ def card_arguments(parser: Parser, _: list[str]) -> None:
 def verify_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `verify`."""
     _dataset(parser)
-    parser.add_argument("--episodes", type=natural, help="episodes to replay in the simulator (default: 300; 0: none)")
-    parser.add_argument("--workers", type=whole, help="processes (default: one per core)")
+    parser.add_argument(
+        "--episodes", type=non_negative_int, help="episodes to replay in the simulator (default: 300; 0: none)"
+    )
+    parser.add_argument("--workers", type=positive_int, help="processes (default: one per core)")
     parser.add_argument("--json", action="store_true", dest="as_json", help="print JSON")
-    trust(parser)
+    add_trust_flag(parser)
 
     def run(as_json: bool, **arguments: Any) -> None:
         report = offbench.verify(**arguments)
@@ -183,7 +194,7 @@ def import_arguments(parser: Parser, _: list[str]) -> None:
     env = parser.add_argument(
         "--env", metavar="RECIPE", help="environment of the file, also for evaluation (default: by the file's name)"
     )
-    completed(env, recipes)
+    complete_with(env, recipes)
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset with the same id")
 
     def run(**arguments: Any) -> None:

@@ -1,4 +1,4 @@
-"""The command line: parse, call, print. Everything it does is a function of the package."""
+"""The command line: parse, call, print. Every command calls a function of the package."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from offbench.common.files import disk_errors
 from offbench.common.interrupts import stop_handlers
 from offbench.common.terminal import labeled
 from offbench.common.text import printable
-from offbench.training.registry import failure
+from offbench.training.registry import describe_failure
 
 COMMANDS: dict[str, dict[str, Command]] = {
     "Data": {
@@ -126,7 +126,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
 BY_NAME = {name: command for group in COMMANDS.values() for name, command in group.items()}
 
 
-RESUMED = ("collect", "train", "benchmark", "behaviour")  # commands that keep checkpoints
+RESUMABLE = ("collect", "train", "benchmark", "behaviour")  # commands that keep checkpoints
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -141,7 +141,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     _open_closed()
     os.environ["MPLBACKEND"] = "Agg"  # figures are files; matplotlib does not import with a name that it does not have
     try:
-        with contextlib.redirect_stderr(_Lossy(sys.stderr)):
+        with contextlib.redirect_stderr(_IgnoreWriteErrors(sys.stderr)):
             _main(words)
     finally:
         _drop_unwritten()
@@ -149,23 +149,23 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _main(words: list[str]) -> None:
     try:
-        with _terminable(), _printable_output():
+        with _stop_on_signals(), _printable_output():
             _run(words)
     except KeyboardInterrupt as stop:
         without = " without --fresh" if "--fresh" in words else ""
         resume = f"; rerun the same command{without} to resume from the last checkpoint, if there is one"
         print(file=sys.stderr)
-        labeled("offbench", f"stopped{resume if _command(words) in RESUMED else ''}", "bold yellow")
+        labeled("offbench", f"stopped{resume if _command(words) in RESUMABLE else ''}", "bold yellow")
         sys.exit(128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT))
     except BrokenPipeError:  # the reader of a pipe (`| head`) has left
         sys.exit(0)
     except Exception as error:
-        labeled("offbench", " ".join(failure(error).split()), "bold red")
+        labeled("offbench", " ".join(describe_failure(error).split()), "bold red")
         sys.exit(2)
 
 
 class _Stream:
-    """A text stream with another `write`."""
+    """A text stream whose `write` a subclass replaces."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -175,7 +175,7 @@ class _Stream:
 
 
 class _Printable(_Stream):
-    """Spells out control characters of files instead of obeying them."""
+    """Escapes control characters, so that text from files cannot control the terminal."""
 
     @property
     def raw_stream(self) -> TextIO:
@@ -192,21 +192,21 @@ class _Printable(_Stream):
             self._stream.flush()
 
 
-class _Lossy(_Stream):
-    """Drops what cannot be written: a training goes on although its log's disk is full, or its terminal closed."""
+class _IgnoreWriteErrors(_Stream):
+    """Ignores write errors: training continues if the disk of its log is full, or its terminal is closed."""
 
     def write(self, text: str) -> int:
-        with _lost():
+        with _ignored_write_errors():
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        with _lost():
+        with _ignored_write_errors():
             self._stream.flush()
 
 
 @contextlib.contextmanager
-def _lost() -> Iterator[None]:
+def _ignored_write_errors() -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:
@@ -261,7 +261,7 @@ class Terminated(KeyboardInterrupt):
 
 
 @contextlib.contextmanager
-def _terminable() -> Iterator[None]:
+def _stop_on_signals() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end a command as Ctrl-C does: its processes end too, and a line is printed."""
 
     def stop(number: int, _: object) -> NoReturn:
@@ -269,7 +269,7 @@ def _terminable() -> Iterator[None]:
             signal.signal(number, signal.SIG_IGN)  # a closed terminal may send SIGHUP twice
         raise Terminated(number)
 
-    def again(ignored: sys.UnraisableHookArgs) -> None:
+    def resend(ignored: sys.UnraisableHookArgs) -> None:
         if isinstance(ignored.exc_value, KeyboardInterrupt):
             number = getattr(ignored.exc_value, "number", signal.SIGINT)
             threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
@@ -279,7 +279,7 @@ def _terminable() -> Iterator[None]:
     before = {number: handler for number, handler in stop_handlers().items() if number != signal.SIGINT}
     for number in before:
         signal.signal(number, stop)
-    hook, sys.unraisablehook = sys.unraisablehook, again  # a stop within `__del__` or a callback would be lost
+    hook, sys.unraisablehook = sys.unraisablehook, resend  # a stop within `__del__` or a callback would be lost
     try:
         yield
     finally:

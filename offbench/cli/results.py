@@ -7,9 +7,19 @@ from json import dumps
 from typing import Any
 
 import offbench
-from offbench.cli.arguments import Parser, completed, local_datasets, methods, natural, number, recipes, trust, whole
+from offbench.cli.arguments import (
+    Parser,
+    add_trust_flag,
+    complete_with,
+    local_datasets,
+    methods,
+    non_negative_int,
+    number,
+    positive_int,
+    recipes,
+)
 from offbench.common.files import JsonObject
-from offbench.common.terminal import is_terminal, note, print_lines, print_table, say
+from offbench.common.terminal import is_terminal, note, print_line, print_lines, print_table
 from offbench.common.text import counted
 
 RUNS_HELP = "folder of the runs (default: runs)"
@@ -20,7 +30,7 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
     from offbench.analysis.normalize import FORMATS
 
     parser.add_argument("returns", nargs="*", type=number, metavar="RETURN", help="returns to score, with --env")
-    completed(
+    complete_with(
         parser.add_argument("--env", metavar="ENV", help="shipped environment or recipe file of the returns"), recipes
     )
     parser.add_argument("--runs", default="runs", metavar="DIR", help=RUNS_HELP)
@@ -60,7 +70,7 @@ def print_scores(rows: list[JsonObject], style: str = "table") -> None:
         return
     print_table(**score_table(rows, is_terminal(sys.stdout)))
     for line in notes(rows):
-        say(f"note: {line}", "dim")
+        print_line(f"note: {line}", "dim")
 
 
 def report_arguments(parser: Parser, _: list[str]) -> None:
@@ -73,17 +83,17 @@ def report_arguments(parser: Parser, _: list[str]) -> None:
     datasets = parser.add_argument(
         "--datasets", nargs="+", metavar="ID", help="only these datasets: ids, or patterns such as 'hopper-*'"
     )
-    completed(datasets, local_datasets)
+    complete_with(datasets, local_datasets)
     only = parser.add_argument("--methods", nargs="+", metavar="NAME", help="only these methods, as tables name them")
-    completed(only, methods)
+    complete_with(only, methods)
 
     parser.set_defaults(run=lambda **options: print(f"saved {offbench.report(**options)}"))
 
 
 def compare_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `compare`."""
-    completed(parser.add_argument("a", metavar="A", help="a method as tables name it, e.g. td3_bc"), methods)
-    completed(
+    complete_with(parser.add_argument("a", metavar="A", help="a method as tables name it, e.g. td3_bc"), methods)
+    complete_with(
         parser.add_argument(
             "b", metavar="B", help="the method to compare with, e.g. 'bdb (beta=0.5)' or bdb/beta=0.5"
         ),
@@ -107,9 +117,9 @@ def compare_arguments(parser: Parser, _: list[str]) -> None:
 def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `evaluate`."""
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_POLICY", help="run directories or policy files")
-    completed(parser.add_argument("--env", help="environment to use instead of the policy's own"), recipes)
-    parser.add_argument("--episodes", type=whole, default=10, help="number of episodes (default: 10)")
-    parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
+    complete_with(parser.add_argument("--env", help="environment to use instead of the policy's own"), recipes)
+    parser.add_argument("--episodes", type=positive_int, default=10, help="number of episodes (default: 10)")
+    parser.add_argument("--seed", type=non_negative_int, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mode")
     parser.add_argument(
         "--similarity", action="store_true", help="compute the similar score of runs on their datasets instead"
@@ -129,8 +139,8 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
         default=0.1,
         help="similar score by action: largest root mean square distance (default: 0.1)",
     )
-    parser.add_argument("--workers", type=whole, help="processes (default: one per core)")
-    trust(parser)
+    parser.add_argument("--workers", type=positive_int, help="processes (default: one per core)")
+    add_trust_flag(parser)
 
     def run(
         paths: list[str],
@@ -162,13 +172,13 @@ def video_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `video`."""
     parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run, a policy file, or ENV:LEVEL (hopper:medium)")
     parser.add_argument("--out", default="video.gif", metavar="FILE", help=".gif or .mp4 (default: video.gif)")
-    completed(parser.add_argument("--env", help="environment to use instead of the policy's own"), recipes)
-    parser.add_argument("--episodes", type=whole, default=1, help="number of episodes (default: 1)")
+    complete_with(parser.add_argument("--env", help="environment to use instead of the policy's own"), recipes)
+    parser.add_argument("--episodes", type=positive_int, default=1, help="number of episodes (default: 1)")
     parser.add_argument("--seconds", type=number, help="maximum duration (default: whole episodes)")
-    parser.add_argument("--seed", type=natural, default=0, help="seed of the episodes (default: 0)")
-    parser.add_argument("--fps", type=whole, default=25, help="frames per second (default: 25)")
-    parser.add_argument("--size", type=whole, default=480, help="longer side in pixels (default: 480)")
-    trust(parser)
+    parser.add_argument("--seed", type=non_negative_int, default=0, help="seed of the episodes (default: 0)")
+    parser.add_argument("--fps", type=positive_int, default=25, help="frames per second (default: 25)")
+    parser.add_argument("--size", type=positive_int, default=480, help="longer side in pixels (default: 480)")
+    add_trust_flag(parser)
 
     parser.set_defaults(run=lambda **options: print(f"saved {offbench.video(**options)}"))
 

@@ -7,7 +7,17 @@ from typing import Any
 
 import offbench
 from offbench.cli.algorithm_flags import add_settings, moved_flag, notices
-from offbench.cli.arguments import Parser, auto, completed, local_datasets, recipes, seed_list, share, trust, whole
+from offbench.cli.arguments import (
+    Parser,
+    add_trust_flag,
+    auto,
+    complete_with,
+    local_datasets,
+    positive_int,
+    recipes,
+    seed_list,
+    shard,
+)
 from offbench.cli.results import print_scores
 from offbench.common.terminal import hint, note, print_lines
 
@@ -21,11 +31,11 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     algorithm, named = _algorithm(words)
     names = ", ".join(algorithm_names())
     argument = parser.add_argument("algorithm", metavar="ALGO", help=f"one of {names}, or ./FILE.py:CLASS")
-    completed(argument, algorithm_names)
+    complete_with(argument, algorithm_names)
     dataset = parser.add_argument(
         "--dataset", required=True, nargs="+", metavar="ID", help="ids of local Minari datasets"
     )
-    completed(dataset, local_datasets)
+    complete_with(dataset, local_datasets)
     _environment(parser)
     parser.add_argument("--download", action="store_true", help="first download missing datasets from Minari's server")
     parser.add_argument(
@@ -35,9 +45,11 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         metavar="LIST",
         help="seeds to run: 3, 0,1,2 or 0:5 (0 to 4) (default: 0)",
     )
-    parser.add_argument("--steps", type=whole, default=1_000_000, help="updates (default: 1,000,000)")
-    parser.add_argument("--eval-every", type=whole, default=5_000, help="updates between evaluations (default: 5,000)")
-    parser.add_argument("--eval-episodes", type=whole, default=10, help="episodes per evaluation (default: 10)")
+    parser.add_argument("--steps", type=positive_int, default=1_000_000, help="updates (default: 1,000,000)")
+    parser.add_argument(
+        "--eval-every", type=positive_int, default=5_000, help="updates between evaluations (default: 5,000)"
+    )
+    parser.add_argument("--eval-episodes", type=positive_int, default=10, help="episodes per evaluation (default: 10)")
     _machine(parser)
     parser.add_argument("--fresh", action="store_true", help="delete the runs of this command and train them again")
     parser.add_argument(
@@ -50,7 +62,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         return
     moved = moved_flag(algorithm, words)
     algorithm = "bdb_plus" if moved else algorithm
-    parser.asked = f"offbench train {algorithm}"
+    parser.help_command = f"offbench train {algorithm}"
     config = add_settings(parser, algorithm)
 
     def run(**arguments: Any) -> None:
@@ -95,12 +107,14 @@ def _environment(parser: Parser) -> None:
     env = parser.add_argument(
         "--env", metavar="RECIPE", help="the environment to evaluate in (default: the one that the dataset names)"
     )
-    completed(env, recipes)
+    complete_with(env, recipes)
 
 
 def _machine(parser: Parser) -> None:
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
-    parser.add_argument("--workers", type=whole, help="processes for training and evaluation (default: one per core)")
+    parser.add_argument(
+        "--workers", type=positive_int, help="processes for training and evaluation (default: one per core)"
+    )
     parser.add_argument(
         "--stack",
         type=auto,
@@ -115,7 +129,7 @@ def _machine(parser: Parser) -> None:
         help="type of matrix products: float32, tf32 (GPUs), bfloat16 (GPUs, some CPUs) (default: float32)",
     )
     parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the runs (default: runs)")
-    trust(parser)
+    add_trust_flag(parser)
 
 
 def benchmark_arguments(parser: Parser, words: list[str]) -> None:
@@ -123,12 +137,12 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
     from offbench.benchmarks.grid import shipped_grids
 
     grid = parser.add_argument("grid", metavar="GRID", help=f"{', '.join(shipped_grids())}, or a grid file")
-    completed(grid, shipped_grids)
+    complete_with(grid, shipped_grids)
     _environment(parser)
     parser.add_argument("--plan", action="store_true", help="print the runs, their time and disk space, and exit")
     parser.add_argument("--budget", metavar="TIME", help="write checkpoints and stop after this time: 90s, 9m or 2h")
     parser.add_argument(
-        "--shard", type=share, default=(0, 1), metavar="I/N", help="train share I of N, counted from 0"
+        "--shard", type=shard, default=(0, 1), metavar="I/N", help="train share I of N, counted from 0"
     )
     parser.add_argument(
         "--executor",

@@ -1,4 +1,4 @@
-"""The type of arrays, and a hash over named ones."""
+"""The array type, and a hash of named arrays."""
 
 from __future__ import annotations
 

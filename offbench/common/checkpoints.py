@@ -13,7 +13,7 @@ from safetensors.torch import save
 
 from offbench.common.arrays import content_sha256
 from offbench.common.errors import DamagedError
-from offbench.common.files import JsonObject, damage, regular, write_bytes
+from offbench.common.files import JsonObject, damage, open_regular, write_bytes
 from offbench.common.terminal import inform
 
 KEPT = 2
@@ -49,7 +49,7 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], J
     path = path_of(folder, step)
     try:
         with damage(str(path), "is damaged", "using the one before it"):
-            os.close(regular(path))  # safe_open would wait for a FIFO
+            os.close(open_regular(path))  # safe_open would wait for a FIFO
             with safe_open(path, framework="pt") as file:
                 state = json.loads((file.metadata() or {})["offbench"])
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -84,7 +84,7 @@ def load_newest(folder: Path) -> tuple[dict[str, torch.Tensor], JsonObject] | No
 
 
 def keep_newest(folder: Path, newest: int) -> None:
-    """Delete all checkpoints but the newest two up to step `newest`; those of later steps are damaged."""
+    """Delete all checkpoints except the newest two up to step `newest`. Later ones could not be loaded."""
     kept = [step for step in steps(folder) if step <= newest][:KEPT]
     for step in steps(folder):
         if step not in kept:

@@ -1,4 +1,4 @@
-"""The one error that users see: a line that says what is wrong and what to do."""
+"""The error that users see: one line that says what is wrong and what to do."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import re
 import traceback
 from collections.abc import Iterable
 
-NEAR = 0.76  # similarity of two names (difflib): more than iql and cql, less than hoper and hopper
-DRAWING = ("MUJOCO_GL", "PYOPENGL_PLATFORM")  # environment variables that MuJoCo and PyOpenGL read when they load
+NEAR = 0.76  # least difflib ratio of similar names: above that of iql and cql, below that of hoper and hopper
+# environment variables that MuJoCo and PyOpenGL read when they load
+RENDERING_VARIABLES = ("MUJOCO_GL", "PYOPENGL_PLATFORM")
 SHOW_TRACEBACK = "OFFBENCH_TRACEBACK=1 shows the traceback"
 
 
@@ -18,11 +19,11 @@ class OffbenchError(Exception):
 
 
 class DamagedError(OffbenchError):
-    """The content of a file is at fault, rather than the disk, a lock or a permission."""
+    """The content of a file is invalid, as opposed to an error of the disk, a lock or a permission."""
 
 
 def nearest(name: str, valid: Iterable[str]) -> str | None:
-    """Return the valid name that `name` is a typing error or a part of, or None."""
+    """Return the valid name that `name` misspells or is a part of, or None."""
     names = sorted(valid)
     close = difflib.get_close_matches(name, names, n=1, cutoff=NEAR)
     containing = [candidate for candidate in names if len(name) >= 3 and name in candidate]
@@ -37,9 +38,9 @@ def unknown(what: str, name: str, valid: Iterable[str]) -> OffbenchError:
     return OffbenchError(f"unknown {what} {name!r}: {hint}")
 
 
-def drawing_variable(error: BaseException) -> str | None:
+def rendering_variable(error: BaseException) -> str | None:
     """Return the environment variable, as NAME=VALUE, that kept MuJoCo or PyOpenGL from loading; None if none did."""
-    given = [f"{name}={os.environ[name]}" for name in DRAWING if os.environ.get(name)]
+    set_variables = [f"{name}={os.environ[name]}" for name in RENDERING_VARIABLES if os.environ.get(name)]
     modules = {str(frame.f_globals.get("__name__", "")) for frame, _ in traceback.walk_tb(error.__traceback__)}
     at_fault = any(re.match(r"OpenGL\b|mujoco\..*(gl_context|egl|osmesa|glfw)", name) for name in modules)
-    return " and ".join(given) if given and at_fault else None
+    return " and ".join(set_variables) if set_variables and at_fault else None

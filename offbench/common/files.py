@@ -22,7 +22,7 @@ from offbench.common.errors import DamagedError, OffbenchError
 
 JsonObject: TypeAlias = dict[str, Any]  # a JSON object whose values nothing has checked yet
 
-# errno to remedy
+# remedies by errno
 OPEN_FILES: dict[int | None, str] = dict.fromkeys((errno.EMFILE, errno.ENFILE), "raise the limit with `ulimit -n`")
 LOCKED = (
     "another program has it open for writing: wait until it is closed (if this disk has no file locks, set "
@@ -34,15 +34,15 @@ WRITE_REMEDIES: dict[int | None, str] = {
 }
 DISK = "check the disk or the network that holds it, and run the command again"
 NO_MEMORY = "close other programs; if there is enough memory, it is damaged"
-READ_REMEDIES: dict[int | None, str] = {  # of errors that say nothing against a file's content
+READ_REMEDIES: dict[int | None, str] = {  # for errors that do not mean damaged content
     **OPEN_FILES,
     **dict.fromkeys((errno.EAGAIN, errno.EWOULDBLOCK, errno.EDEADLK, errno.ENOLCK), LOCKED),
     **dict.fromkeys((errno.EACCES, errno.EPERM), "check its permissions"),
     errno.ENOMEM: NO_MEMORY,
     **dict.fromkeys((errno.EIO, errno.ENXIO, errno.ENODEV, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN), DISK),
 }
-SHIPPED = "reinstall offbench"  # the remedy for damage to a file that comes with offbench
-ORPHANS = 3.0  # seconds to wait for a lock: processes whose parent was killed notice it within one
+REINSTALL = "reinstall offbench"  # the remedy for damage to a file that comes with offbench
+LOCK_TIMEOUT = 3.0  # seconds to wait for a lock: processes whose parent was killed notice it within one
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -55,7 +55,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def is_exhausted(error: BaseException) -> bool:
-    """Return whether memory or file descriptors have run out, which says nothing against what was being done."""
+    """Return whether memory or file descriptors have run out, so that the operation itself may be valid."""
     return is_out_of_memory(error) or (isinstance(error, OSError) and error.errno in OPEN_FILES)
 
 
@@ -65,7 +65,7 @@ def disk_errors(what: str, elsewhere: str = "choose another folder") -> Iterator
 
     Args:
         what: the file or folder that is written.
-        elsewhere: how to choose another one.
+        elsewhere: the advice to choose another location, as the end of the message.
     """
     try:
         yield
@@ -82,11 +82,11 @@ def disk_errors(what: str, elsewhere: str = "choose another folder") -> Iterator
 
 
 @contextlib.contextmanager
-def exclusive_lock(path: Path, what: str, timeout: float = ORPHANS) -> Iterator[None]:
+def exclusive_lock(path: Path, what: str, timeout: float = LOCK_TIMEOUT) -> Iterator[None]:
     """Hold a lock file for this process, so that no other one does the same work.
 
     Args:
-        path: the lock file, a hidden name; a file beside it says which process holds the lock.
+        path: the lock file, with a hidden name; a second file in its folder names the process that holds it.
         what: what is locked and why, e.g. "hopper-medium-v0 is being recorded".
         timeout: seconds to wait for another process to release the lock.
 
@@ -168,27 +168,27 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
     Raises:
         OffbenchError: as `write_bytes`.
     """
-    asides: dict[Path, Path] = {}
+    temporaries: dict[Path, Path] = {}
     try:
         for path, data in contents.items():
             check_ownership(path)
-            asides[path] = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+            temporaries[path] = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
             with disk_errors(str(path)):
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with open(asides[path], "xb") as file:
+                with open(temporaries[path], "xb") as file:
                     file.write(data)
                     file.flush()
                     os.fsync(file.fileno())
-        for path, aside in asides.items():
+        for path, temporary in temporaries.items():
             with disk_errors(str(path)):
-                os.replace(aside, path)
+                os.replace(temporary, path)
     except BaseException as error:
-        for aside in asides.values():
+        for temporary in temporaries.values():
             with contextlib.suppress(OSError):
-                aside.unlink(missing_ok=True)
+                temporary.unlink(missing_ok=True)
         if isinstance(error, OffbenchError):
             for path in contents:
-                check_ownership(path)  # if that is why
+                check_ownership(path)  # raises a clearer error if the folder was moved
         raise
 
 
@@ -234,7 +234,7 @@ def write_json(path: Path, value: object) -> None:
     write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
-def read_json(path: Path, remedy: str = SHIPPED) -> JsonObject:
+def read_json(path: Path, remedy: str = REINSTALL) -> JsonObject:
     """Read the JSON object in a file. Raises OffbenchError if it is missing or damaged: the `remedy` is for that."""
     try:
         with damage(str(path), "is damaged or not JSON", remedy):
@@ -248,7 +248,7 @@ def read_json(path: Path, remedy: str = SHIPPED) -> JsonObject:
 
 
 def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
-    """Return a CSV file's content; floats keep every digit that matters."""
+    """Return a CSV file's content; floats are written with full precision."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
@@ -258,18 +258,18 @@ def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
 
 @contextlib.contextmanager
 def damage(name: str, fault: str, remedy: str) -> Iterator[None]:
-    """Turn any exception of reading a file from elsewhere into one line.
+    """Turn any exception raised while a file is read into an error of one line.
 
     Errors of the operating system (a lock, no permission, a failing disk) and missing packages are reported as such,
     all others as damage. A missing file is left to the caller.
 
     Args:
         name: the file, e.g. "run/config.json".
-        fault: what is wrong with it if its content is, e.g. "is damaged".
-        remedy: what to do about that.
+        fault: how the message describes invalid content, e.g. "is damaged".
+        remedy: what to do about invalid content.
 
     Raises:
-        DamagedError: the content is at fault.
+        DamagedError: the content is invalid.
         OffbenchError: it cannot be read for another reason.
     """
     try:
@@ -283,13 +283,13 @@ def damage(name: str, fault: str, remedy: str) -> Iterator[None]:
 
 
 def _read_remedy(error: BaseException) -> str | None:
-    """Return what to do about a failed read that says nothing against the content, None for any other."""
+    """Return what to do about a read error that does not mean damaged content; None for any other error."""
     if is_out_of_memory(error):
         return NO_MEMORY
     if isinstance(error, ImportError):
         return f"install the package {error.name}" if error.name else "install it"
     number = getattr(error, "errno", None)
-    if number is None and isinstance(error, OSError | RuntimeError):  # libhdf5 puts it into the text alone
+    if number is None and isinstance(error, OSError | RuntimeError):  # libhdf5 has the number in the text only
         inside = re.search(r"\berrno = (\d+)", str(error))
         number = int(inside[1]) if inside else None
     return READ_REMEDIES.get(number)
@@ -300,7 +300,7 @@ def _reason(error: BaseException) -> str:
     return f"there is no {text}" if type(error) is KeyError else text
 
 
-def regular(path: str | Path, flags: int = os.O_RDONLY) -> int:
+def open_regular(path: str | Path, flags: int = os.O_RDONLY) -> int:
     """Open a regular file (an `opener` for `open`): a FIFO or device could block or never end.
 
     Raises:
@@ -309,7 +309,7 @@ def regular(path: str | Path, flags: int = os.O_RDONLY) -> int:
     try:
         descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
     except OSError as error:
-        if error.errno == errno.ENXIO:  # a socket, or a device of nothing
+        if error.errno == errno.ENXIO:  # a socket, or a device that does not exist
             raise OSError(f"{path} is not a regular file") from None
         raise
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -320,7 +320,7 @@ def regular(path: str | Path, flags: int = os.O_RDONLY) -> int:
 
 def read_bytes(path: Path) -> bytes:
     """Return the content of a regular file. Raises OSError."""
-    with open(path, "rb", opener=regular) as file:
+    with open(path, "rb", opener=open_regular) as file:
         return file.read()
 
 
@@ -336,5 +336,5 @@ def sha256(data: bytes) -> str:
 
 def sha256_of(path: Path) -> str:
     """Return the hexadecimal SHA-256 of a regular file, read in pieces."""
-    with open(path, "rb", opener=regular) as file:
+    with open(path, "rb", opener=open_regular) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

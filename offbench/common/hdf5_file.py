@@ -1,6 +1,6 @@
 """HDF5 files written through callbacks that never raise, because libhdf5 can crash the process if one does.
 
-Errors (a full disk) and stops (Ctrl-C, SIGTERM) are noted there, and raised between writes.
+The callbacks record errors (a full disk) and signals (Ctrl-C, SIGTERM), which are raised between writes.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from pathlib import Path
 
 import h5py
 
-from offbench.common.interrupts import stops_noted
+from offbench.common.interrupts import collect_stop_signals
 
-MOST_COMPRESSED = 1000  # largest ratio of an array's size to the file's: more is a damaged or malicious file
+MOST_COMPRESSED = 1000  # largest accepted ratio of an array's size to the file's; others are damaged or malicious
 
 
 class SafeFile:
     """A file object for h5py whose writes never raise.
 
-    The first error is kept and later writes are dropped; `check` raises it. The writer calls `check` now and then, and
-    at the end.
+    The first error is kept and later writes are dropped; `check` raises it. The caller runs `check`
+    regularly and at the end.
 
     Args:
-        stops: the signals that `stops_noted` collects.
+        stops: the signals that `collect_stop_signals` collects.
     """
 
     def __init__(self, path: Path, stops: Sequence[int] = ()) -> None:
@@ -37,7 +37,7 @@ class SafeFile:
         if self._error is not None:
             raise self._error
         if self._stops:
-            raise KeyboardInterrupt  # `stops_noted` raises what belongs to the signal at its end
+            raise KeyboardInterrupt  # `collect_stop_signals` raises the signal's exception at its end
 
     def write(self, data: bytes | memoryview) -> int:
         """Write, or keep the error."""
@@ -106,7 +106,7 @@ CALLBACKS = {
 @contextlib.contextmanager
 def safe_file(path: Path) -> Iterator[SafeFile]:
     """Open a new file for libhdf5. Raises OSError at the end if a write failed."""
-    with stops_noted(within=CALLBACKS) as stops:
+    with collect_stop_signals(within=CALLBACKS) as stops:
         file = SafeFile(path, stops)
         try:
             yield file
@@ -118,7 +118,7 @@ def safe_file(path: Path) -> Iterator[SafeFile]:
 
 
 def stored_elsewhere(file: h5py.File) -> str | None:
-    """Return the name of something below the root that is a link, or stored in another file."""
+    """Return the name of an object below the root that is a link or stored in another file, or None."""
     groups, seen = [file["/"]], set()
     while groups:
         group = groups.pop()

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: collected while something is finished first, such as a checkpoint, then raised again.
+"""Collect Ctrl-C, SIGTERM and SIGHUP while work such as a checkpoint completes, and raise them afterwards.
 
 offbench.training.trainer writes the checkpoint, offbench.training.jobs ends the worker processes.
 """
@@ -16,7 +16,7 @@ from collections.abc import Collection, Iterator
 from typing import Any
 
 # SIGHUP comes when a terminal or an SSH connection is closed; Windows has none
-STOPS = {signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
+STOP_SIGNALS = {signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
 
 
 def stop_handlers() -> dict[signal.Signals, Any]:
@@ -26,21 +26,21 @@ def stop_handlers() -> dict[signal.Signals, Any]:
     """
     if threading.current_thread() is not threading.main_thread():
         return {}
-    handlers = {stop: signal.getsignal(stop) for stop in STOPS}
+    handlers = {stop: signal.getsignal(stop) for stop in STOP_SIGNALS}
     # None is a handler that Python cannot restore
     return {stop: handler for stop, handler in handlers.items() if handler not in (None, signal.SIG_IGN)}
 
 
 @contextlib.contextmanager
-def stops_delayed() -> Iterator[None]:
-    """Delay Ctrl-C, SIGTERM and SIGHUP until the end.
+def delay_stop_signals() -> Iterator[None]:
+    """Delay Ctrl-C, SIGTERM and SIGHUP until the context ends.
 
-    The started process inherits the signal mask. In this process the mask alone is not enough: another thread, such as
-    a library's, may take the signal, and Python's handler still runs in the main thread.
+    A process started within it inherits the signal mask. In this process the mask alone is not enough: another
+    thread, such as a library's, may take the signal, and Python's handler still runs in the main thread.
     """
     masks = hasattr(signal, "pthread_sigmask")
-    with stops_noted():
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS) if masks else set()
+    with collect_stop_signals():
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS) if masks else set()
         try:
             yield
         finally:
@@ -49,7 +49,9 @@ def stops_delayed() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stops_noted(second_at_once: bool = False, within: Collection[types.CodeType] | None = None) -> Iterator[list[int]]:
+def collect_stop_signals(
+    second_at_once: bool = False, within: Collection[types.CodeType] | None = None
+) -> Iterator[list[int]]:
     """Collect Ctrl-C, SIGTERM and SIGHUP in the list that this yields, and raise the first again at the end.
 
     Args:
@@ -62,7 +64,7 @@ def stops_noted(second_at_once: bool = False, within: Collection[types.CodeType]
         if within is not None and not any(caller.f_code in within for caller, _ in traceback.walk_stack(frame)):
             signal.signal(number, handlers[signal.Signals(number)])
             signal.raise_signal(number)
-            signal.signal(number, note)  # it did not raise
+            signal.signal(number, note)  # the original handler did not raise
             return
         received.append(number)
         if second_at_once and number == signal.SIGINT:

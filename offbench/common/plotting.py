@@ -1,4 +1,4 @@
-"""Figures: matplotlib without a screen."""
+"""Matplotlib figures without a display."""
 
 from __future__ import annotations
 

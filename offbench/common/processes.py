@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import OPEN_FILES
-from offbench.common.interrupts import STOPS, stops_delayed
+from offbench.common.interrupts import STOP_SIGNALS, delay_stop_signals
 
 if TYPE_CHECKING:
     from ctypes import c_byte
@@ -70,16 +70,16 @@ def start_errors() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def quiet_start() -> Iterator[None]:
+def uninterrupted_start() -> Iterator[None]:
     """Start a worker process without interruption (submitting a task may start one).
 
-    Ctrl-C, SIGTERM and SIGHUP are delayed meanwhile, as half a start would leave the pool unusable. The user's script
-    is hidden, as a spawned process would run it again. A worker gets one thread for its matrix products: with a thread
-    per core in each worker, recording was several times slower.
+    Ctrl-C, SIGTERM and SIGHUP are delayed meanwhile, as an interrupted start would leave the pool unusable. The user's
+    script is hidden, as a spawned process would run it again. A worker gets one thread for its matrix products: with a
+    thread per core in each worker, recording was several times slower.
     """
     script = sys.modules["__main__"]
     threads = {name: "1" for name in THREADS if name not in os.environ}
-    with start_errors(), stops_delayed(), environment(threads):
+    with start_errors(), delay_stop_signals(), environment(threads):
         sys.modules["__main__"] = types.ModuleType("__main__")
         try:
             yield
@@ -94,17 +94,17 @@ class _Worker:
 
 
 def start_worker(parent: int, closing: c_byte | None = None) -> None:
-    """Leave Ctrl-C to the parent, and end when the parent has ended (even by kill -9).
+    """Ignore Ctrl-C, which the parent handles, and exit when the parent has exited (even by kill -9).
 
     Args:
         closing: a shared number; once it is not 0, the results of this worker are not needed any more. A worker that
             has one leaves SIGTERM and SIGHUP to the parent too: Slurm and a closed terminal send them to all
             processes, and a parent that saves a checkpoint still waits for its evaluations.
     """
-    for stop in STOPS if closing is not None else {signal.SIGINT}:
+    for stop in STOP_SIGNALS if closing is not None else {signal.SIGINT}:
         signal.signal(stop, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)  # blocked while it started
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)  # blocked while it started
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
     _Worker.closing = closing
 

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar with rate and time left on a terminal, plain lines elsewhere."""
+"""Progress of long operations: a bar with rate and time left on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.progress import Progress as Bar
 
-PLAIN_INTERVAL = 30.0  # seconds between two plain lines without news
-REFRESH_INTERVAL = 0.1  # seconds between two pictures of the bar
+PLAIN_INTERVAL = 30.0  # seconds between two plain lines without a new note
+REFRESH_INTERVAL = 0.1  # seconds between two updates of the bar
 NARROWEST_BAR = 18  # columns of the bar, its percents and the space around them
 
 
 class Progress:
-    """Counts steps towards a total. Writes to stderr, so that stdout stays for results.
+    """Shows how many of a total number of steps are done, on stderr; stdout is for results.
 
     Where steps differ in cost, their work (in seconds, or any other unit) is counted beside them, for the time left.
     Without a terminal, every new note (such as the score of an evaluation) gets a line, and so does every half minute.
@@ -49,11 +49,11 @@ class Progress:
                 raise
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, _: object, __: TracebackType | None) -> None:
+    def __exit__(self, exception_type: type[BaseException] | None, _: object, __: TracebackType | None) -> None:
         if self._bar is not None:
             self._update(self._bar)
             self._bar.stop()
-        elif kind is None and self.done > self._first and self._printed != self.done:
+        elif exception_type is None and self.done > self._first and self._printed != self.done:
             self._print()
 
     def skip(self, done: int, work: float) -> None:
@@ -63,7 +63,7 @@ class Progress:
         self._worked += work
         self._first_work += work
 
-    def say(self, line: str) -> None:
+    def print_line(self, line: str) -> None:
         """Print a line of its own, above the bar."""
         if self._bar is not None:
             self._bar.console.print(line)
@@ -71,15 +71,15 @@ class Progress:
             print(line, file=sys.stderr, flush=True)
 
     def to(self, done: int, note: str = "", work: float | None = None) -> None:
-        """Say that `done` steps are done, with a note such as the last score."""
-        news = note not in ("", self._note)
+        """Set the number of completed steps and their work, and a note such as the last score."""
+        is_new = note not in ("", self._note)
         self.done, self._note = done, note or self._note
         self._worked = done if work is None else work
         waited = time.monotonic() - self._last
         if self._bar is not None:
             if waited >= REFRESH_INTERVAL:
                 self._update(self._bar)
-        elif news or waited > PLAIN_INTERVAL:
+        elif is_new or waited > PLAIN_INTERVAL:
             self._print()
 
     def _update(self, bar: Bar) -> None:
@@ -95,7 +95,7 @@ class Progress:
         return f"{duration(left)} left"
 
     def _details(self, bar: Bar) -> str:
-        """Return what stands beside the bar. A narrow terminal leaves out the rate."""
+        """Return the text beside the bar. A narrow terminal leaves out the rate."""
         done, rate, left = f"{self.done:,}/{self.total:,}", f"{self._rate():,.0f} steps/s", self._left()
         details = f"{done}, {rate}, {left}"
         room = bar.console.width - len(self.what) - NARROWEST_BAR

@@ -15,8 +15,8 @@ PHYSICS = ("mujoco", "gymnasium", "numpy")  # packages whose version can change 
 Hardware = dict[str, str | int | None]
 
 
-class MadeWith(TypedDict):
-    """What a run's numbers depend on in addition to settings and seed: a `Session` of its config.json."""
+class TrainingPlatform(TypedDict):
+    """What a run's results depend on in addition to settings and seed; recorded in its config.json."""
 
     device: str
     precision: str
@@ -37,15 +37,15 @@ def versions() -> dict[str, str]:
 
 
 def hardware() -> Hardware:
-    """Return processor and cores; `vectors` are the vector instructions of PyTorch, which a run's bits depend on."""
-    import torch  # slow to import, and `versions` does without
+    """Return processor and cores; `vectors` are the vector instructions of PyTorch, which affect the last bits."""
+    import torch  # slow to import; `versions` does not need it
 
     vectors = torch.backends.cpu.get_cpu_capability()
     return {"processor": _processor(), "vectors": vectors, "cores": os.cpu_count(), "machine": platform.machine()}
 
 
-def made_with(device: str, precision: str) -> MadeWith:
-    """Return what runs are trained with on a device (cpu, cuda or cuda:N)."""
+def training_platform(device: str, precision: str) -> TrainingPlatform:
+    """Return the versions and hardware of training on `device` (cpu, cuda or cuda:N) with `precision`."""
     made = hardware()
     if device != "cpu":
         import torch
@@ -65,7 +65,7 @@ def _processor() -> str:
 
 
 def _cpuinfo() -> str:
-    """Return what Linux says of the processor; "" on other systems."""
+    """Return the content of /proc/cpuinfo; "" on systems without it."""
     try:
         return Path("/proc/cpuinfo").read_text()
     except OSError:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 Evaluations = Mapping[int, Sequence[tuple[float, int]]]  # {step: [(return, length) of each episode]}
-LARGEST = 1e15  # what no step, return or reference reaches: scores and their squares stay finite
+LARGEST_VALUE = 1e15  # limit of steps, returns and references: scores and their squares stay finite
 SMALLEST_GAP = 1e-12  # between the references of a score
 
 
@@ -29,7 +29,7 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
 
 def are_references(low: float, high: float) -> bool:
     """Return whether returns can be normalized by these two: finite, and the expert's above the random policy's."""
-    return max(abs(low), abs(high)) < LARGEST and high - low >= SMALLEST_GAP
+    return max(abs(low), abs(high)) < LARGEST_VALUE and high - low >= SMALLEST_GAP
 
 
 def normalize(value: float, low: float, high: float) -> float:
@@ -37,16 +37,16 @@ def normalize(value: float, low: float, high: float) -> float:
     return 100.0 * (value - low) / (high - low)
 
 
-LAST = 10  # evaluations that a run's score is the mean of
+SCORED_EVALUATIONS = 10  # evaluations that a run's score is the mean of
 
 
 def window(evaluations: Evaluations) -> tuple[int, ...]:
     """Return the steps of the evaluations that a run's score is the mean of: its last 10."""
-    return tuple(sorted(evaluations)[-LAST:])
+    return tuple(sorted(evaluations)[-SCORED_EVALUATIONS:])
 
 
 def check_steps(steps: Sequence[int], every: int) -> None:
-    """Check that the evaluations of a run are those due every `every` updates; the last one may lie before its turn.
+    """Check that the evaluations of a run are those due every `every` updates; the last one may come earlier.
 
     Raises:
         ValueError: one is missing, or is of a step at which none is due.

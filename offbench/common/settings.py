@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from offbench.common.errors import DamagedError, OffbenchError, unknown
-from offbench.common.text import LARGEST, whole_number
+from offbench.common.text import LARGEST_INTEGER, whole_number
 
 T = TypeVar("T")
 Field: TypeAlias = dataclasses.Field[Any]
@@ -41,7 +41,7 @@ def setting(
         low, high: inclusive bounds; `above` is an exclusive lower bound.
         choices: the values a string may have.
         per_run: runs that differ in this setting may train in one stack.
-        notes: {value: what a user should know who trains with it}.
+        notes: {value: a note to print when a run is trained with it}.
     """
     metadata = {
         "help": help,
@@ -69,7 +69,7 @@ def build(cls: type[T], values: Mapping[str, object], where: str) -> T:
     """Make a settings object from a mapping, e.g. a parsed TOML table.
 
     Args:
-        where: what the mapping is, for the error line.
+        where: the name of the mapping in error messages.
 
     Raises:
         OffbenchError: an unknown key (the nearest valid one is named), a missing one, a wrong type or a value out of
@@ -102,7 +102,7 @@ def read_back(cls: type[T], values: object, file: Path | str, remedy: str) -> T:
 
 def _from_json(cls: type[T], values: object) -> T:
     if not isinstance(values, dict):
-        raise ValueError(f"must be a JSON object, not {shown(values)}")
+        raise ValueError(f"must be a JSON object, not {short_repr(values)}")
     return cls(**_checked(cls, {key: values[key] for key in fields(cls) if key in values}, "", parse=False))
 
 
@@ -123,13 +123,13 @@ def check(cls: type, name: str, value: object, where: str, *, parse: bool = True
     """Return `value` as the type of the field `name`. Raises OffbenchError, which begins with `where`.
 
     Args:
-        parse: whether text may stand for a number, a list and so on, as on a command line.
+        parse: whether to convert text to numbers, lists and so on, as for a command line.
     """
     hint = _type_hints(cls)[name]
     try:
         value = _convert(value, hint, parse)
     except (TypeError, ValueError, OverflowError):
-        raise _error(where, f"{name} must be {_describe(hint)}, not {shown(value)}") from None
+        raise _error(where, f"{name} must be {_describe(hint)}, not {short_repr(value)}") from None
     metadata = fields(cls)[name].metadata
     numbers = value if isinstance(value, tuple) else (value,)
     for number in numbers:
@@ -137,8 +137,8 @@ def check(cls: type, name: str, value: object, where: str, *, parse: bool = True
     return value
 
 
-def shown(value: object) -> str:
-    """Return any value of a file as short text for an error line."""
+def short_repr(value: object) -> str:
+    """Return the repr of a value, shortened for an error message."""
     try:
         return f"{value!r:.60}"
     except (ValueError, RecursionError):  # Python prints no number of 5000 digits
@@ -152,7 +152,7 @@ def _check_range(name: str, value: object, metadata: Mapping[str, Any], where: s
         raise _error(where, f"{name} must be {kind} {', '.join(choices)}, not {value!r}")
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
-    if isinstance(value, int) and abs(value) > LARGEST:
+    if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
         raise _error(where, f"{name} is too large a number")
     low, above, high = metadata.get("low"), metadata.get("above"), metadata.get("high")
     if not math.isfinite(value):
@@ -211,13 +211,13 @@ def _convert_one(value: object, option: Any, parse: bool) -> Any:
     return value
 
 
-def _truth(text: str) -> bool:
+def _parse_bool(text: str) -> bool:
     if text.lower() not in ("true", "false"):
         raise ValueError
     return text.lower() == "true"
 
 
-def _none(text: str) -> None:
+def _parse_none(text: str) -> None:
     if text != "none":
         raise ValueError
 
@@ -225,9 +225,9 @@ def _none(text: str) -> None:
 _FROM_TEXT: dict[type, Callable[[str], object]] = {
     int: whole_number,
     float: float,
-    bool: _truth,
+    bool: _parse_bool,
     str: str,
-    type(None): _none,
+    type(None): _parse_none,
 }
 
 

@@ -1,4 +1,4 @@
-"""A table that is written once and printed as CSV, Markdown and LaTeX; reports.page prints it as HTML."""
+"""Tables that can be written as CSV, Markdown and LaTeX, and as HTML by offbench.reports.page."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ SPECIAL = {
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell.
+    """One cell of a table.
 
     Attributes:
-        text: what it says.
-        value: what it sorts by, if that is not its text.
-        more: what belongs to the text (steps, seeds): in brackets after it, in small print in HTML.
+        text: the text shown.
+        value: the sort key, if it is not the text.
+        more: further text (steps, seeds): in brackets after `text`, in small print in HTML.
         below: a second line in small print (HTML only).
-        best: whether it is the best of its row, or otherwise to be marked.
-        detail: the id of the box that a click opens (HTML only).
+        best: whether to highlight it, for example as the best of its row.
+        detail: the id of the dialog that a click opens (HTML only).
     """
 
     text: str
@@ -46,7 +46,7 @@ class Cell:
 
     @property
     def full(self) -> str:
-        """The text with what belongs to it."""
+        """The text, followed by `more` in brackets."""
         return f"{self.text} ({self.more})" if self.more else self.text
 
 
@@ -56,7 +56,7 @@ class Table:
 
     Attributes:
         name: the stem of its files and its id in the page.
-        heads: how many leading columns name the row.
+        heads: number of leading columns that name the row.
         small: a second line of each column's header (HTML; in the other formats it follows the first in brackets).
     """
 
@@ -93,7 +93,7 @@ class Table:
 
 
 def files(table: Table) -> Mapping[str, bytes]:
-    """Return a table's files by their endings."""
+    """Return the contents of a table's files by their extensions."""
     return {"csv": table.csv(), "md": table.markdown().encode(), "tex": table.latex().encode()}
 
 
@@ -111,7 +111,7 @@ def tabular(header: Sequence[str], cells: Sequence[Sequence[str]], names: int) -
 
 
 def plain(text: str) -> str:
-    """Return text that Markdown prints as it is."""
+    """Return text with Markdown's special characters escaped."""
     escaped = "".join("\\" + c if c in "\\`*_[]|#" else c for c in printable(text))
     return html.escape(escaped, quote=False).replace("\n", " ")
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 NARROW, NARROWEST = 28, 12  # widths of a column of names
 LABEL = re.compile(r" *([A-Za-z][\w -]*?  +|\w+_sha256 )(?=\S)")  # at the start of a line
-GLUE = "\0"  # stands for a space that is no place to break a line
+GLUE = "\0"  # placeholder for a space where a line must not break
 
 
 def is_terminal(stream: TextIO | None) -> bool:
@@ -39,7 +39,7 @@ def console(stream: TextIO) -> Console:
     return Console(file=raw, color_system=None if plain else "auto", highlight=False, markup=False, emoji=False)
 
 
-def say(line: str, style: str = "") -> None:
+def print_line(line: str, style: str = "") -> None:
     """Print a line to stdout, styled on a terminal."""
     if is_terminal(sys.stdout):
         console(sys.stdout).print(printable(line), style=style or None)
@@ -66,7 +66,7 @@ def hint(*words: str) -> None:
 
 
 def note(text: str) -> None:
-    """Print something worth knowing to stderr."""
+    """Print `note: text` to stderr."""
     labeled("note", text, "bold cyan")
 
 
@@ -90,7 +90,7 @@ def _wrapped(text: str, width: int) -> str:
 def print_lines(lines: Iterable[str]) -> None:
     """Print lines of text to stdout, such as `return      mean 1197.1, std 355.1`.
 
-    On a terminal, labels are in color, and the rest of a long line stands below its text.
+    On a terminal, labels are in color, and the continuation of a long line is indented below its text.
     """
     if not is_terminal(sys.stdout):
         for line in lines:
@@ -122,11 +122,11 @@ def print_table(
 ) -> None:
     """Print a table to stdout.
 
-    In a pipe it is aligned text, one line a row and nothing left out. On a terminal it is as wide as the terminal:
+    In a pipe it is aligned text, one line per row with all columns. On a terminal it is as wide as the terminal:
     long names and headers wrap.
 
     Args:
-        names: how many leading columns are text; the others are aligned to the right.
+        names: number of leading columns that are text; the others are aligned to the right.
         group: on a terminal, rows with the same first cell stand below a heading with it.
         optional: columns to leave out on a terminal that is too narrow, the first one first.
         marked: (row, column) of cells in bold.
@@ -139,18 +139,19 @@ def print_table(
     shown = list(range(1 if group else 0, len(header)))
     widths = [max(len(line[column]) for line in [header, *rows]) for column in range(len(header))]
 
-    def missing() -> int:
+    def overflow() -> int:
+        """Return how many columns of the terminal the table lacks."""
         return sum(widths[column] + 2 for column in shown) - 2 + indent - int(screen.width)
 
     def narrow(least: Mapping[int, int]) -> None:
-        """Take width from the columns in `least` that are wider than it says, from the widest first."""
-        while missing() > 0 and (wide := [c for c in shown if c in least and widths[c] > least[c]]):
+        """Narrow the columns in `least` to at least these widths, the widest first, until the table fits."""
+        while overflow() > 0 and (wide := [c for c in shown if c in least and widths[c] > least[c]]):
             widths[max(wide, key=widths.__getitem__)] -= 1
 
     texts, numbers = range(names), range(names, len(header))
     narrow(dict.fromkeys(texts, NARROW))
     for title in optional:
-        if missing() > 0:
+        if overflow() > 0:
             shown = [column for column in shown if header[column] != title]
     narrow({c: max(map(len, [*header[c].split(), *(row[c] for row in rows)]), default=0) for c in numbers})
     narrow(dict.fromkeys(texts, NARROWEST))
@@ -172,7 +173,7 @@ def _indented(line: Text, by: int) -> Text:
 
 
 def _lines(row: Sequence[str], layout: Sequence[tuple[int, int, bool]], bold: Collection[int] = ()) -> list[Text]:
-    """Return a row as the lines that it takes, its long names wrapped."""
+    """Return the lines of a row, with long names wrapped."""
     from rich.text import Text
 
     wrapped = [textwrap.wrap(printable(row[column]), width) or [""] for column, width, _ in layout]

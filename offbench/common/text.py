@@ -1,19 +1,19 @@
-"""Numbers in sentences, and text of files where it is shown."""
+"""Numbers and tables as text, and safe output of text from files."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
 
-LARGEST = 2**63 - 1  # whole number that files hold
-MOST_SEEDS = 100_000  # of one command: a larger count is a typing error, and would fill the memory
+LARGEST_INTEGER = 2**63 - 1  # largest whole number in files
+MOST_SEEDS = 100_000  # most seeds of one command; a larger count is a typing error and would fill the memory
 
 
 def whole_number(text: str) -> int:
-    """Return the whole number that a text gives, in digits or as 1e6.
+    """Return the whole number in a text, written in digits or as 1e6.
 
     Raises:
-        ValueError: it gives none.
+        ValueError: the text is not a whole number.
     """
     try:
         return int(text)  # exact also beyond 2**53
@@ -60,14 +60,14 @@ def compact(number: int) -> str:
     return f"{number:,}"
 
 
-# control characters but tab and line feed, those that turn the direction of text, break lines or cannot be seen
+# control characters except tab and line feed; characters that reverse text, break lines or are invisible
 _CONTROLS = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u2069\ufeff\U000e0000-\U000e007f]"
 )
 
 
 def printable(text: str) -> str:
-    r"""Return text of a file as a terminal may show it: control characters are escaped, as in `\x1b[2J`."""
+    r"""Return text that is safe to print: control characters are escaped, as in `\x1b[2J`."""
     return _CONTROLS.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
 
 

@@ -1,7 +1,7 @@
 """`card`: an environment's dataset card, from its ladder and its five recorded levels.
 
     card.json   each level's statistics, the versions they hold for, and a content hash for each MuJoCo version
-    README.md   the same to read, with references, rungs and provenance
+    README.md   the same for people, with references, rungs and provenance
     card.png    the learning curve and the histogram of returns of each level
 
 `collect` compares the content hash of a level that it records at full size with the shipped card.json, and prints
@@ -63,14 +63,14 @@ def card(env: str, out: str | Path | None = None, behaviour_dir: str | Path = BE
         warn(f"the levels of {recipe.name} are out of order: {means}")
     folder = Path(out or f"{recipe.name}-card")
     made = {name: versions()[name] for name in PHYSICS}
-    _keep_hashes(recipe, facts, made["mujoco"])
+    _add_shipped_hashes(recipe, facts, made["mujoco"])
     write_json(folder / "card.json", {"format": "offbench-card-2", "versions": made, "levels": facts})
     _draw(recipe, ladder, levels, folder / "card.png")
     write_bytes(folder / "README.md", _text(recipe, ladder, facts, made).encode())
     return folder
 
 
-def compare(recipe: Recipe, level: str, content_sha256: str) -> str | None:
+def compare_with_card(recipe: Recipe, level: str, content_sha256: str) -> str | None:
     """Return a line that says whether a level recorded at full size has the content on the shipped card.
 
     None if there is no card, or if the level is not one of the five.
@@ -97,7 +97,7 @@ def _shipped_card(recipe: Recipe) -> JsonObject | None:
     return read_json(path) if path is not None and path.exists() else None
 
 
-def _keep_hashes(recipe: Recipe, facts: dict[str, JsonObject], mujoco: str) -> None:
+def _add_shipped_hashes(recipe: Recipe, facts: dict[str, JsonObject], mujoco: str) -> None:
     """Add the shipped card's content hashes of other MuJoCo versions to each level, if it describes the same ladder.
 
     The content of medium-replay shows it: it comes from training, so it is the same on every MuJoCo version.

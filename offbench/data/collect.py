@@ -21,7 +21,7 @@ from offbench.common.seeds import check_seed
 from offbench.common.terminal import inform
 from offbench.data import minari_store, minari_writer
 from offbench.data.behaviour_policy import BehaviourPolicy, level_name, read_behaviour_policy
-from offbench.data.card import compare
+from offbench.data.card import compare_with_card
 from offbench.data.levels import Part, full_size, parse_level, parse_mix, shares
 from offbench.data.minari_reader import open_minari
 from offbench.data.other_references import warn_other_references
@@ -34,10 +34,10 @@ from offbench.rollouts.policy import Policy, uniform
 from offbench.rollouts.rollouts import Episode, Rollouts
 
 POLICY = "policy"  # the source of a part that a user's own policy plays
-AGENTLESS = ("uniform", POLICY)  # sources that need no behaviour agent
+WITHOUT_AGENT = ("uniform", POLICY)  # sources that need no behaviour agent
 # two recordings with the same values of these metadata, on the same versions of these packages, are the same
 IDENTITY = ("env", "level", "seed", "recipe_sha256", "parts", "references")
-HOME = "https://github.com/offbench/offbench"
+REPOSITORY = "https://github.com/offbench/offbench"
 
 
 def collect(
@@ -69,7 +69,7 @@ def collect(
         overwrite: replace a dataset of that id. Without it, the same dataset recorded again is left as it is, and
             another one is an error.
         retrain: use a behaviour agent trained here instead of the shipped one.
-        accept: record the nearest policy where none is near a fraction, or medium is far from a third of the expert.
+        accept: record the nearest policy even if none is near a fraction, or medium is far from a third of the expert.
         policy: record with this policy instead of a level: an agent's zip of Stable-Baselines3 (nothing of it is
             unpickled), a run's folder, a policy file, or `module:function` of the user's own. It acts as it was
             trained to explore: a stochastic one samples.
@@ -83,7 +83,7 @@ def collect(
         OffbenchError: anything that the user can fix, in one line.
     """
     recipe, seed = load_recipe(env), check_seed(seed)
-    given = None
+    policy_source = None
     if policy is None:
         if name is not None:
             raise OffbenchError("--name goes with --policy; give a dataset's id by --id")
@@ -94,20 +94,20 @@ def collect(
         if mix is not None or level != "medium":
             raise OffbenchError("--policy records one policy: leave out --level and --mix")
         name = level = level_name(name, str(policy))
-        given, parts = str(policy), (Part(POLICY),)
+        policy_source, parts = str(policy), (Part(POLICY),)
     dataset_id = minari_store.check_id(dataset_id or f"{recipe.name}-{name}-v{recipe.version}")
     if steps is not None and steps < 1:
         raise OffbenchError(f"steps must be at least 1, not {steps}")
     workers = default_workers(workers)
 
     def prepare(ladder: Ladder | None) -> tuple[_Recording, list[Rung | None], list[int], JsonObject]:
-        recording = _Recording(recipe, ladder, seed, workers, given)
+        recording = _Recording(recipe, ladder, seed, workers, policy_source)
         sources = [recording.source(part, accept) for part in parts]
         counts = _counts(recipe, ladder, parts, steps)
         return recording, sources, counts, _metadata(recording, dataset_id, mix or level, parts, sources, counts)
 
     ladder = find_ladder(recipe, Path(behaviour_dir), retrain)
-    trained = ladder is not None or all(part.source in AGENTLESS for part in parts)
+    trained = ladder is not None or all(part.source in WITHOUT_AGENT for part in parts)
     prepared = prepare(ladder) if trained else None
     if prepared and not overwrite and minari_store.exists(dataset_id) and _is_same(dataset_id, prepared[-1]):
         minari_store.tidy(dataset_id)
@@ -123,15 +123,15 @@ def collect(
             streams = (recording.episodes(*item) for item in zip(parts, sources, counts, itertools.count()))
             episodes = _counted(itertools.chain.from_iterable(streams), progress)
             content = minari_writer.write(path, episodes, recording.spec, metadata, total, recording.spaces)
-    if seed == 0 and steps is None and not retrain and (said := compare(recipe, name, content)):
-        inform(said)
+    if seed == 0 and steps is None and not retrain and (comparison := compare_with_card(recipe, name, content)):
+        inform(comparison)
     if ladder:
         warn_other_references(recipe, ladder)
     return dataset_id
 
 
 def _is_same(dataset_id: str, wanted: JsonObject) -> bool:
-    """Return whether a dataset was recorded from what `wanted`, its metadata to be, says, on this physics.
+    """Return whether a dataset was recorded with the same metadata as `wanted`, on the installed physics.
 
     Raises:
         DamagedError: its data cannot be opened.
@@ -158,7 +158,7 @@ def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:
 
 
 def _counts(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...], steps: int | None) -> list[int]:
-    """Return the transitions of each part; medium-replay alone is as long as training made it."""
+    """Return the transitions of each part; medium-replay alone has all transitions of the training."""
     available = ladder.info.medium_replay.transitions if ladder else 0
     total = steps if steps is not None else _full_size(recipe, ladder, parts)
     counts = shares(parts, total)
@@ -180,9 +180,11 @@ def _full_size(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...]) -
 
 
 class _Recording:
-    """What all parts of one dataset share. Without a ladder, parts are of uniform actions only."""
+    """What all parts of one dataset share. Without a ladder, only WITHOUT_AGENT parts can be recorded."""
 
-    def __init__(self, recipe: Recipe, ladder: Ladder | None, seed: int, workers: int, given: str | None) -> None:
+    def __init__(
+        self, recipe: Recipe, ladder: Ladder | None, seed: int, workers: int, policy_source: str | None
+    ) -> None:
         self.recipe, self._ladder, self.seed = recipe, ladder, seed
         self.workers = workers if workers > 1 else 0  # a single one would be no faster than this process
         self.spec = recipe.env_spec()
@@ -190,13 +192,15 @@ class _Recording:
         self.mujoco = model_of(env) is not None
         self.spaces = self.observation_space, action_space = spaces_of(env, recipe.env_id)
         self.bounds = action_space.low, action_space.high
-        self.given: BehaviourPolicy | None = None
-        if given is not None:
-            self.given = read_behaviour_policy(given, *self.bounds, self.observation_space.shape[0], recipe.env_id)
+        self.own_policy: BehaviourPolicy | None = None
+        if policy_source is not None:
+            self.own_policy = read_behaviour_policy(
+                policy_source, *self.bounds, self.observation_space.shape[0], recipe.env_id
+            )
 
     @property
     def ladder(self) -> Ladder:
-        """Of the behaviour agent."""
+        """The behaviour agent's ladder."""
         assert self._ladder is not None
         return self._ladder
 
@@ -214,7 +218,7 @@ class _Recording:
         Raises:
             OffbenchError: no rung is near what the part is defined as, and the user did not accept another.
         """
-        if part.source in AGENTLESS:
+        if part.source in WITHOUT_AGENT:
             return None
         if part.source not in ("medium", "replay", "expert"):
             return self._nearest(float(part.source), accept)
@@ -243,22 +247,22 @@ class _Recording:
         if MEDIUM <= fraction <= MEDIUM_AT_MOST:
             return
         low, high = MEDIUM_LIMITS
-        said = f"medium of {self.recipe.name} is at {fraction:.2f} of the expert's return"
+        message = f"medium of {self.recipe.name} is at {fraction:.2f} of the expert's return"
         if not low <= fraction <= high and not accept:
-            raise OffbenchError(f"{said}, far from {MEDIUM:.2f}; `offbench collect --accept` records it anyway")
+            raise OffbenchError(f"{message}, far from {MEDIUM:.2f}; `offbench collect --accept` records it anyway")
         remedy = "" if self.recipe.folder else "; a shorter [sac] segment in the recipe keeps more policies"
-        inform(f"{said}: no policy of the training is at {MEDIUM:.2f} to {MEDIUM_AT_MOST}{remedy}")
+        inform(f"{message}: no policy of the training is at {MEDIUM:.2f} to {MEDIUM_AT_MOST}{remedy}")
 
     def policy(self, rung: Rung | None) -> Policy | FunctionPolicy:
         """Return the policy that plays a part."""
-        if self.given is not None:
-            return self.given.policy
+        if self.own_policy is not None:
+            return self.own_policy.policy
         if rung is not None:
             return self.ladder.load(rung)
         return uniform(*self.bounds, self.observation_space.shape[0], self.recipe.env_id)
 
     def episodes(self, part: Part, rung: Rung | None, count: int, index: int) -> Iterator[Episode]:
-        """Yield a part's episodes, exactly `count` transitions: the last one is cut."""
+        """Yield a part's episodes with exactly `count` transitions; the last one is cut short."""
         if part.source == "replay":
             expected = self.ladder.info.medium_replay.sha256
             yield from cut_at(load_replay(self.ladder.replay, expected, self.observation_space, *self.bounds), count)
@@ -266,16 +270,18 @@ class _Recording:
         with (
             Rollouts(self.spec, self.workers) as rollouts,
             # the part is in the seed, so that both halves of medium-expert have their own episodes
-            contextlib.closing(rollouts.episodes(self.policy(rung), self.seed, (index,), enough=count)) as endless,
+            contextlib.closing(
+                rollouts.episodes(self.policy(rung), self.seed, (index,), transitions_needed=count)
+            ) as endless,
         ):
             yield from cut_at(endless, count)
 
-    def words(self, part: Part, rung: Rung | None) -> str:
-        """Return what a part is recorded from, for the dataset's description."""
+    def origin_text(self, part: Part, rung: Rung | None) -> str:
+        """Return how a part was recorded, for the dataset's description."""
         if part.source == "uniform":
             return "uniform-random actions"
-        if self.given is not None:
-            return f"the policy {self.given.source}"
+        if self.own_policy is not None:
+            return f"the policy {self.own_policy.source}"
         if rung is None:
             fraction = self.ladder.fraction(self.ladder.role("medium"))
             info, which = self.ladder.info, ""
@@ -292,9 +298,9 @@ class _Recording:
         if part.source == "replay":
             medium = self.ladder.info.levels["medium"]
             return described | {"training_steps": medium, "sha256": self.ladder.info.medium_replay.sha256}
-        if self.given is not None:
-            made = {"policy": self.given.source, "algorithm": self.given.algorithm}
-            return described | made | {"policy_sha256": self.given.sha256}
+        if self.own_policy is not None:
+            made = {"policy": self.own_policy.source, "algorithm": self.own_policy.algorithm}
+            return described | made | {"policy_sha256": self.own_policy.sha256}
         if rung is None:
             random = self.references["random"]
             return described | {"return": random["return"], "interval": [random["low"], random["high"]]}
@@ -333,14 +339,14 @@ def _metadata(
     sources: list[Rung | None],
     counts: list[int],
 ) -> JsonObject:
-    """Return Minari's metadata, all of it, and ours under one key."""
+    """Return the dataset's metadata: Minari's fields, and offbench's own under one key."""
     recipe, references, made = recording.recipe, recording.references, versions()
     described = [recording.describe(*item) for item in zip(parts, sources, counts, strict=True)]
     full, total = _full_size(recipe, recording._ladder, parts), sum(counts)
     short = f" A short recording: {total:,} of {full:,} transitions." if total < full else ""
-    words = [recording.words(part, rung) for part, rung in zip(parts, sources, strict=True)]
-    if recording.given:
-        algorithm = recording.given.algorithm
+    origin_texts = [recording.origin_text(part, rung) for part, rung in zip(parts, sources, strict=True)]
+    if recording.own_policy:
+        algorithm = recording.own_policy.algorithm
     else:
         algorithm = "random" if all(part.source == "uniform" for part in parts) else "SAC (Stable-Baselines3)"
     return {
@@ -350,8 +356,8 @@ def _metadata(
         "algorithm_name": algorithm,
         "author": {"offbench"},
         "author_email": {"offbench@example.org"},
-        "code_permalink": f"{HOME}/tree/v{made['offbench']}",
-        "description": f"{recipe.env_id}, level {level}: {', then '.join(words)}. Recorded by offbench.{short}",
+        "code_permalink": f"{REPOSITORY}/tree/v{made['offbench']}",
+        "description": f"{recipe.env_id}, level {level}: {', then '.join(origin_texts)}. Recorded by offbench.{short}",
         "requirements": [f"mujoco=={made['mujoco']}", f"gymnasium=={made['gymnasium']}"],
         "ref_min_score": references["random"]["return"],
         **({"ref_max_score": references["expert"]["return"]} if "expert" in references else {}),

@@ -51,19 +51,19 @@ def read_source(path: Path, file: h5py.File) -> Source:
     """Return an opened file's columns, checked. Raises OffbenchError if it is not a D4RL file, or damaged."""
     columns = {}
     for name in (*COLUMNS, *OPTIONAL):
-        column = _own(path, file, name)
+        column = _local_column(path, file, name)
         if column is not None:
             columns[name] = column
         elif name in COLUMNS:
             raise OffbenchError(f"{path} is not a D4RL file: it has no {name}")
     _check(path, columns)
-    return Source(path, columns, _about(path, file))
+    return Source(path, columns, _export_metadata(path, file))
 
 
-def _own(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
+def _local_column(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
     """Return a column of the file itself, None if there is none.
 
-    Every link is looked at before it is followed: it may lead to any file of this machine.
+    Every link is checked before it is followed: it may lead to any file of this machine.
     """
     node = file
     for part in name.split("/"):
@@ -94,7 +94,7 @@ def _check(path: Path, columns: dict[str, h5py.Dataset]) -> None:
         raise OffbenchError(f"{path}: next_observations {columns['next_observations'].shape} differ from observations")
 
 
-def _about(path: Path, file: h5py.File) -> JsonObject:
+def _export_metadata(path: Path, file: h5py.File) -> JsonObject:
     """Return the metadata that `offbench export` wrote into the file, checked; {} for other files."""
     text = file.attrs.get("offbench")
     if text is None:
@@ -102,18 +102,20 @@ def _about(path: Path, file: h5py.File) -> JsonObject:
     try:
         about = json.loads(text)
         fields = {key: about[key] for key in (*_STRINGS, *_LISTS, *NUMBERS, minari_store.KEY) if key in about}
-        sound = all(isinstance(fields.get(key, ""), str) for key in _STRINGS)
-        sound = sound and all(all(isinstance(item, str) for item in fields.get(key, [])) for key in _LISTS)
-        sound = sound and all(math.isfinite(fields.get(key, 0)) for key in NUMBERS)
-        if not sound or not isinstance(fields.get(minari_store.KEY, {}), dict):
-            raise ValueError("a value of another type")
+        valid = all(isinstance(fields.get(key, ""), str) for key in _STRINGS)
+        valid = valid and all(all(isinstance(item, str) for item in fields.get(key, [])) for key in _LISTS)
+        valid = valid and all(math.isfinite(fields.get(key, 0)) for key in NUMBERS)
+        if not valid or not isinstance(fields.get(minari_store.KEY, {}), dict):
+            raise ValueError("a value has the wrong type")
         for key in ("env_spec", "eval_env_spec"):
             if key in fields:
                 parse_spec(fields[key])
-        kept = tuple(deserialize_space(fields[key]) for key in ("observation_space", "action_space") if key in fields)
+        spaces = tuple(
+            deserialize_space(fields[key]) for key in ("observation_space", "action_space") if key in fields
+        )
     except Exception as error:  # Gymnasium and Minari raise anything for JSON that is not theirs
         raise OffbenchError(f"{path}: its offbench metadata are damaged ({error}); export the dataset again") from None
-    return fields | {"spaces": kept}
+    return fields | {"spaces": spaces}
 
 
 _STRINGS = ("env_spec", "eval_env_spec", "observation_space", "action_space", "algorithm_name", "description")

@@ -29,15 +29,15 @@ def download(dataset_id: str) -> None:
     with exclusive_lock(root / ".offbench-download.lock", "another dataset is being downloaded"):
         if minari_store.exists(dataset_id):  # another process was faster
             return
-        aside = root / ".offbench-download"
-        shutil.rmtree(aside, ignore_errors=True)  # of a download that was killed
+        temporary = root / ".offbench-download"
+        shutil.rmtree(temporary, ignore_errors=True)  # of a download that was killed
         try:
-            with environment({"MINARI_DATASETS_PATH": str(aside)}):
+            with environment({"MINARI_DATASETS_PATH": str(temporary)}):
                 _fetch(dataset_id)
             with disk_errors(str(root)):
-                _move(aside, root)
+                _move(temporary, root)
         finally:
-            shutil.rmtree(aside, ignore_errors=True)
+            shutil.rmtree(temporary, ignore_errors=True)
     if not target.exists():
         raise OffbenchError(f"Minari's server sent no dataset {dataset_id}")
 
@@ -56,11 +56,11 @@ def _fetch(dataset_id: str) -> None:
         raise OffbenchError(f"cannot download {dataset_id}: {reason}; {remedy}") from error
 
 
-def _move(aside: Path, root: Path) -> None:
+def _move(temporary: Path, root: Path) -> None:
     """Move datasets and the descriptions of their namespaces to Minari's folder; nothing there is replaced."""
-    datasets = [path.parent.parent for path in aside.glob("**/data/metadata.json")]
-    for path in [*aside.glob("**/namespace_metadata.json"), *datasets]:
-        inside = path.relative_to(aside)
+    datasets = [path.parent.parent for path in temporary.glob("**/data/metadata.json")]
+    for path in [*temporary.glob("**/namespace_metadata.json"), *datasets]:
+        inside = path.relative_to(temporary)
         if not any(part.startswith(".") for part in inside.parts) and not (root / inside).exists():
             (root / inside).parent.mkdir(parents=True, exist_ok=True)
             path.replace(root / inside)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from minari import MinariDataset
 
 FORMATS = {"d4rl": (".hdf5", ".h5"), "npz": (".npz",)}  # and how their files end
-METADATA = (  # of Minari, that an export keeps
+METADATA = (  # fields of Minari's metadata that an export keeps
     *("env_spec", "eval_env_spec", "algorithm_name", "description", "author", "author_email", "requirements"),
     *("ref_min_score", "ref_max_score", "num_episodes_average_score", minari_store.KEY),
 )
@@ -52,7 +52,7 @@ def export(dataset_id: str, out: str | Path, *, style: str | None = None, drop_t
 
     Args:
         dataset_id: its id.
-        out: the file; what is there is replaced at the last moment.
+        out: the file; an existing one is replaced at the end.
         style: d4rl or npz (default: as the file ends, .hdf5 or .npz).
         drop_timeouts: npz only: leave out the steps at a timeout, as D4RL's qlearning_dataset does. (It also never
             reads a file's very last row; one that terminates is kept here.)
@@ -69,12 +69,12 @@ def export(dataset_id: str, out: str | Path, *, style: str | None = None, drop_t
         raise OffbenchError("--drop-timeouts goes with --format npz: readers of D4RL files drop them")
     path = output_file(out)
     with disk_errors(str(path)), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-        aside = Path(folder) / path.name
+        temporary = Path(folder) / path.name
         with unchanged(dataset_id):
-            _write(dataset_id, aside, style, drop_timeouts)
-        with open(aside, "rb") as file:
+            _write(dataset_id, temporary, style, drop_timeouts)
+        with open(temporary, "rb") as file:
             os.fsync(file.fileno())
-        os.replace(aside, path)
+        os.replace(temporary, path)
     return path
 
 
@@ -128,7 +128,7 @@ def _columns(data: MinariDataset, dataset_id: str, progress: Progress, content: 
 
 
 def _seed_columns(data: MinariDataset, dataset_id: str) -> Callable[[int | None, int], Columns]:
-    """Return what makes an episode's columns of its seed.
+    """Return a function from an episode's seed and length to its seed columns.
 
     Seeds are int64, and -1 where there is none; if one is 2**63 or more (Minari's DataCollector draws 64 bits) they
     are uint64, with a column that says which episodes have one.
@@ -197,9 +197,9 @@ def _write_npz(path: Path, parts: Iterator[Columns], drop_timeouts: bool, droppe
     """Write the columns one by one to raw files, then zip them: no column is ever whole in memory.
 
     Args:
-        dropped: an import has left out the steps at timeouts already; what is flagged now is the step before.
+        dropped: whether an import has left out the steps at timeouts, so that the step before is flagged.
     """
-    kinds: dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]] = {}
+    layouts: dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]] = {}
     count = 0
     with contextlib.ExitStack() as stack:
         raw: dict[str, SafeFile] = {}
@@ -210,14 +210,14 @@ def _write_npz(path: Path, parts: Iterator[Columns], drop_timeouts: bool, droppe
             for name, array in part.items():
                 if name not in raw:
                     raw[name] = stack.enter_context(safe_file(path.with_name(f"{name}.raw")))
-                    kinds[name] = (array.dtype, array.shape[1:])
+                    layouts[name] = (array.dtype, array.shape[1:])
                 raw[name].write(np.ascontiguousarray(array[keep]).tobytes())
                 raw[name].check()
             count += int(keep.sum())
         disk = stack.enter_context(safe_file(path))
         with zipfile.ZipFile(disk, "w") as archive:
             for name, file in raw.items():
-                dtype, shape = kinds[name]
+                dtype, shape = layouts[name]
                 header = {
                     "descr": np.lib.format.dtype_to_descr(dtype),
                     "fortran_order": False,

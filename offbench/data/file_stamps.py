@@ -1,4 +1,4 @@
-"""Whether files are still those that were read or written: by their stamps, and by their hashes where those differ."""
+"""Detect changed files by their stamps (size, times, inode), and by their hashes where stamps differ."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def unchanged(dataset_id: str) -> Iterator[Stamps]:
         ReplacedError: it was replaced meanwhile.
     """
     before = dataset_stamps(dataset_id)
-    words = f"{dataset_id} was replaced while it was read; wait until it is recorded, and run the command again"
+    message = f"{dataset_id} was replaced while it was read; wait until it is recorded, and run the command again"
     try:
         yield before
     except Exception as error:  # Minari raises a ValueError for a missing folder, for example
         if dataset_stamps(dataset_id) == before:
             raise
-        raise ReplacedError(words) from error
+        raise ReplacedError(message) from error
     if dataset_stamps(dataset_id) != before:
-        raise ReplacedError(words)
+        raise ReplacedError(message)
 
 
 def dataset_stamps(dataset_id: str) -> Stamps:
@@ -52,31 +52,31 @@ def dataset_stamps(dataset_id: str) -> Stamps:
 
 
 def stamp(path: Path | str) -> list[int]:
-    """Return what changes with a file's content. Its times can be set, but not when it was last touched (ctime)."""
+    """Return size, mtime, ctime and inode. A program can set a file's mtime, but not its ctime."""
     status = os.stat(path)
     return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
 
 
-def recorded(path: Path) -> tuple[str, list[int]]:
-    """Return a file's hash and the stamp it had before."""
+def hash_and_stamp(path: Path) -> tuple[str, list[int]]:
+    """Return a file's SHA-256, and its stamp from before it was read."""
     before = stamp(path)
     return sha256_of(path), before
 
 
-def checked(paths: Mapping[str, Path], written: JsonObject) -> JsonObject:
-    """Return the hashes and stamps of files that are as recorded, with today's stamps.
+def check_files(paths: Mapping[str, Path], written: JsonObject) -> JsonObject:
+    """Return {name: [SHA-256, current stamp]} of files that are unchanged since `written` was recorded.
 
     A file with the recorded stamp has not been touched. Any other one, such as a copy, is hashed.
 
     Raises:
-        ValueError: a file is missing, one too many, or not as recorded.
+        ValueError: a file is missing, unexpected or changed.
     """
     if paths.keys() != written.keys():
-        raise ValueError("other files")
+        raise ValueError("files are missing or unexpected")
     current = dict(written)
     for name, path in paths.items():
         if stamp(path) != written[name][1]:
-            current[name] = list(recorded(path))
+            current[name] = list(hash_and_stamp(path))
             if current[name][0] != written[name][0]:
                 raise ValueError(f"{path} is not what was written")
     return current

@@ -10,7 +10,7 @@ from offbench.common.files import output_file, write_bytes
 from offbench.common.scores import normalize
 from offbench.common.tables import markdown, plain
 from offbench.data import minari_store
-from offbench.data.show import Summary, fact, show, space
+from offbench.data.show import Summary, format_value, show, space
 
 SIZES = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M", 10_000_000: "1M<n<10M"}
 LARGEST = "10M<n<100M"
@@ -64,12 +64,12 @@ def _text(summary: Summary) -> Iterator[str]:
     yield from _table(_content(summary))
     for number, part in enumerate(ours.parts or (), 1):
         yield from ("", f"## Part {number}", "")
-        yield from _table({key.replace("_", " "): fact(value) for key, value in part.items()})
+        yield from _table({key.replace("_", " "): format_value(value) for key, value in part.items()})
     yield from ("", "## Provenance", "")
-    told = {name: getattr(ours, name) for name in ("env", "level", "seed", "recipe_sha256", "content_sha256")}
-    told["imported from"] = ours.imported.get("file")
-    told |= ours.versions
-    recorded = {name.replace("_", " "): fact(value) for name, value in told.items() if value is not None}
+    origin = {name: getattr(ours, name) for name in ("env", "level", "seed", "recipe_sha256", "content_sha256")}
+    origin["imported from"] = ours.imported.get("file")
+    origin |= ours.versions
+    recorded = {name.replace("_", " "): format_value(value) for name, value in origin.items() if value is not None}
     yield from _table(recorded) if recorded else ["Not recorded by offbench."]
 
 

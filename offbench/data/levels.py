@@ -1,4 +1,4 @@
-"""Levels: what each kind of dataset is recorded from. A new level is one more entry in LEVELS."""
+"""Levels: the policies that each dataset is recorded from. A new level is one more entry in LEVELS."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def _percent(fraction: float) -> str:
 
 
 def shares(parts: tuple[Part, ...], total: int) -> list[int]:
-    """Cut `total` transitions into the parts' shares; rounding goes to the last part."""
+    """Divide `total` transitions into the parts' shares; rounding goes to the last part."""
     weights = [part.weight for part in parts]
     cuts = [round(total * sum(weights[: i + 1]) / sum(weights)) for i in range(len(parts))]
     return [end - start for start, end in zip([0, *cuts], cuts, strict=False)]

@@ -16,14 +16,14 @@ from gymnasium.spaces import Box
 
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError
-from offbench.common.files import damage, regular
+from offbench.common.files import damage, open_regular
 from offbench.common.hdf5_file import stored_elsewhere
 from offbench.data import minari_store
 
 if TYPE_CHECKING:
     from minari import EpisodeData, MinariDataset
 
-AGAIN = "record or download it again"
+RECORD_AGAIN = "record or download it again"
 LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -32,18 +32,20 @@ def reading(dataset_id: str) -> Iterator[None]:
     """Read a dataset within this context.
 
     Raises:
-        DamagedError: its content is at fault.
+        DamagedError: its content is invalid.
         OffbenchError: its files are locked, may not be read, or need a package that is not installed.
     """
     try:
-        with damage(dataset_id, "is damaged", AGAIN):
+        with damage(dataset_id, "is damaged", RECORD_AGAIN):
             yield
     except FileNotFoundError as error:
-        raise DamagedError(f"{dataset_id} is damaged (there is no {error.filename or error}); {AGAIN}") from error
+        raise DamagedError(
+            f"{dataset_id} is damaged (there is no {error.filename or error}); {RECORD_AGAIN}"
+        ) from error
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordedEpisode:
     """An episode as a dataset has it, unchecked. Arrays as in Minari's EpisodeData."""
 
     index: int
@@ -63,7 +65,7 @@ class Recorded:
         return self.observations, self.actions, self.rewards, self.terminations, self.truncations
 
 
-def episodes_of(data: MinariDataset, indices: Iterable[int] | None = None) -> Iterator[Recorded]:
+def episodes_of(data: MinariDataset, indices: Iterable[int] | None = None) -> Iterator[RecordedEpisode]:
     """Yield a MinariDataset's episodes (all, or those of `indices`) with their seeds.
 
     Raises:
@@ -77,10 +79,10 @@ def episodes_of(data: MinariDataset, indices: Iterable[int] | None = None) -> It
             seed = None if about.get("options") else about.get("seed")
             flags = episode.terminations, episode.truncations
             arrays = map(np.asarray, (episode.observations, episode.actions, episode.rewards, *flags))
-            yield Recorded(int(episode.id), None if seed is None else int(seed), *arrays)
+            yield RecordedEpisode(int(episode.id), None if seed is None else int(seed), *arrays)
 
 
-def shape_faults(episode: Recorded | EpisodeData, observations: Box, actions: Box) -> Iterator[str]:
+def shape_faults(episode: RecordedEpisode | EpisodeData, observations: Box, actions: Box) -> Iterator[str]:
     """Yield what is wrong with the shapes of an episode: T + 1 observations, T of all else, T at least 1."""
     steps = len(episode.rewards) if np.ndim(episode.rewards) else 0
     shapes = {"observations": (steps + 1, *observations.shape), "actions": (steps, *actions.shape)}
@@ -97,7 +99,7 @@ def open_minari(dataset_id: str) -> MinariDataset:
         OffbenchError: there is none, it is damaged, or its files lead to others.
     """
     check_storage(dataset_id)
-    return open_parsed(dataset_id)
+    return open_unchecked(dataset_id)
 
 
 def check_storage(dataset_id: str) -> None:
@@ -117,19 +119,19 @@ def _files(dataset_id: str) -> list[Path]:
     files = [path for path in paths if not path.is_dir() or path.suffix == ".hdf5"]
     with reading(dataset_id):
         for path in files:
-            os.close(regular(path))
+            os.close(open_regular(path))
     return files
 
 
-def open_parsed(dataset_id: str) -> MinariDataset:
+def open_unchecked(dataset_id: str) -> MinariDataset:
     """Return the MinariDataset of a local id whose storage has not been checked yet; see `open_minari`."""
     metadata = minari_store.read_metadata(dataset_id)
     if "observation_space" not in metadata or "action_space" not in metadata:
         # Minari would make the environment to ask it, running whatever code the file names
-        raise DamagedError(f"{dataset_id} is damaged (its metadata lack a space); {AGAIN}")
+        raise DamagedError(f"{dataset_id} is damaged (its metadata lack a space); {RECORD_AGAIN}")
     size = sum(path.stat().st_size for path in _files(dataset_id))
     if not 0 <= (metadata.get("total_episodes") or 0) <= size:
-        raise DamagedError(f"{dataset_id} is damaged (its files are too small for its episodes); {AGAIN}")
+        raise DamagedError(f"{dataset_id} is damaged (its files are too small for its episodes); {RECORD_AGAIN}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import minari
@@ -140,8 +142,10 @@ def open_parsed(dataset_id: str) -> MinariDataset:
             except ValueError as error:
                 if "Minari version" not in str(error):
                     raise
-                words = " ".join(str(error).split())
-                raise OffbenchError(f"cannot read {dataset_id}: {words}; install another version of minari") from error
+                message = " ".join(str(error).split())
+                raise OffbenchError(
+                    f"cannot read {dataset_id}: {message}; install another version of minari"
+                ) from error
             int(data.total_steps)  # Minari reads it from the metadata when it is asked for
             return data
 

@@ -15,7 +15,7 @@ from filelock import FileLock, Timeout
 
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
 from offbench.common.files import (
-    ORPHANS,
+    LOCK_TIMEOUT,
     JsonObject,
     damage,
     delete,
@@ -37,7 +37,7 @@ with warnings.catch_warnings():
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """What offbench recorded about a dataset; all empty for datasets that it did not record.
+    """What offbench recorded about a dataset; empty for datasets of other programs.
 
     Attributes:
         parts: definition and measured return of each part, as in offbench.data.levels.
@@ -66,7 +66,7 @@ class Provenance:
     final_observations: str | None = None
 
 
-KEY = "offbench"  # under which all that Minari has no field for is kept in the metadata
+KEY = "offbench"  # key in the metadata for everything that Minari has no field for
 
 
 def root() -> Path:
@@ -92,7 +92,7 @@ def path_of(dataset_id: str) -> Path:
 
 
 def local_ids(unreadable: Callable[[OSError], None] | None = None) -> list[str]:
-    """Return the ids of all local datasets, hidden folders and strays left out.
+    """Return the ids of all local datasets; hidden folders, and folders without a dataset, are left out.
 
     Args:
         unreadable: is called with the error of each folder that cannot be read.
@@ -105,19 +105,19 @@ def local_ids(unreadable: Callable[[OSError], None] | None = None) -> list[str]:
         if (real := os.path.realpath(folder)) in seen:  # links can make a circle
             folders.clear()
         seen.add(real)
-        replaced = {match[1] for name in folders if (match := OLD.fullmatch(name))} - set(folders)
+        replaced = {match[1] for name in folders if (match := REPLACED.fullmatch(name))} - set(folders)
         folders[:] = [name for name in folders if not name.startswith(".")]
-        folders += [name for name in replaced if _put_back(Path(folder, name))]
+        folders += [name for name in replaced if _restore_replaced(Path(folder, name))]
     return sorted(ids)
 
 
-def _absent(dataset_id: str) -> OffbenchError:
-    """Return the error for a dataset that is not here: how to record this very one, else the nearest that is here."""
+def _not_found_error(dataset_id: str) -> OffbenchError:
+    """Return the error for a missing dataset: how to record it, or which local id is the most similar."""
     if os.path.isfile(dataset_id):  # unlike Path.is_file, False for a name that no file can have
         what = "a file, not a dataset's id; `offbench import-d4rl` converts D4RL's HDF5 files"
         return OffbenchError(f"{dataset_id} is {what}")
     path = root() / dataset_id
-    if _inside(dataset_id) and os.path.lexists(old := beside(path, "old")):
+    if _inside(dataset_id) and os.path.lexists(old := hidden_path(path, "old")):
         why = "its replacement was interrupted, and it could not be put back"
         return OffbenchError(f"{dataset_id} is not there: {why}; rename {old} to {path}")
     if os.path.isfile(os.path.join(dataset_id, "data", "metadata.json")):
@@ -134,14 +134,14 @@ def _absent(dataset_id: str) -> OffbenchError:
             return OffbenchError(f"unknown dataset {dataset_id!r}: {command} records {name}")
     with contextlib.suppress(OffbenchError):  # no id
         if "/" in check_id(dataset_id):
-            return _not_downloaded(dataset_id)
-    said = str(unknown("dataset", dataset_id, local_ids()))
+            return _not_downloaded_error(dataset_id)
+    text = str(unknown("dataset", dataset_id, local_ids()))
     return OffbenchError(
-        f"{said}{' Or' if said.endswith('?') else ';'} record one: `offbench collect ENV --level LEVEL`"
+        f"{text}{' Or' if text.endswith('?') else ';'} record one: `offbench collect ENV --level LEVEL`"
     )
 
 
-def _not_downloaded(dataset_id: str) -> OffbenchError:
+def _not_downloaded_error(dataset_id: str) -> OffbenchError:
     """Return the error for an id with a namespace, as Minari's server has them (`mujoco/hopper/medium-v0`)."""
     near = nearest(dataset_id, (name for name in local_ids() if "/" in name))
     hint = f"did you mean {near!r}? Or download it" if near else "download it"
@@ -158,7 +158,7 @@ def read_metadata(dataset_id: str) -> JsonObject:
     """
     path = root() / dataset_id / "data" / "metadata.json"
     if not exists(dataset_id):
-        raise _absent(dataset_id)
+        raise _not_found_error(dataset_id)
     remedy = "record or download the dataset again"
     metadata = read_json(path, remedy)
     check_metadata(metadata, path, remedy)
@@ -166,7 +166,7 @@ def read_metadata(dataset_id: str) -> JsonObject:
 
 
 def check_metadata(metadata: JsonObject, where: str | Path, remedy: str) -> None:
-    """Raise DamagedError if a field that offbench reads is of another kind than it should be; all may be missing."""
+    """Raise DamagedError if a field that offbench reads has the wrong type; each may be missing."""
     try:
         _check_fields(metadata)
     except (ValueError, TypeError, RecursionError) as error:
@@ -180,7 +180,7 @@ NUMBERS = ("ref_min_score", "ref_max_score", "total_steps", "total_episodes")
 
 
 def _check_fields(metadata: JsonObject) -> None:
-    """Raise ValueError if one of Minari's fields is of another kind than it should be, or text cannot be written."""
+    """Raise ValueError if one of Minari's fields has the wrong type, or holds text that is not valid UTF-8."""
     json.dumps(metadata, ensure_ascii=False, default=list).encode()
     for key in (*TEXTS, *NUMBERS):
         value = metadata.get(key)
@@ -194,10 +194,10 @@ def _check_fields(metadata: JsonObject) -> None:
 
 
 def exists(dataset_id: str) -> bool:
-    """Return whether there is a local dataset of this id, sound or not. Raises OffbenchError if that is unknown."""
+    """Return whether there is a local dataset of this id, damaged or not. Raises OffbenchError if that is unknown."""
     path = root() / dataset_id / "data" / "metadata.json"
     with damage(str(path), "cannot be looked up", "check the id and the disk"):
-        return _inside(dataset_id) and (path.exists() or (_put_back(root() / dataset_id) and path.exists()))
+        return _inside(dataset_id) and (path.exists() or (_restore_replaced(root() / dataset_id) and path.exists()))
 
 
 def _inside(dataset_id: str) -> bool:
@@ -227,10 +227,10 @@ def check_content(dataset_id: str, metadata: JsonObject, content: str) -> None:
 
 
 def being_recorded(dataset_id: str) -> bool:
-    """Whether another process holds a dataset id for writing."""
+    """Return whether another process is writing a dataset."""
     path = path_of(dataset_id)
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(beside(path, "lock"))
+    lock = FileLock(hidden_path(path, "lock"))
     try:
         lock.acquire(timeout=0)
     except Timeout:
@@ -239,24 +239,24 @@ def being_recorded(dataset_id: str) -> bool:
     return False
 
 
-def beside(path: Path, ending: str) -> Path:
-    """Return a hidden path beside a dataset: its `lock`, `partial` while it is written, `old` while it is replaced."""
+def hidden_path(path: Path, ending: str) -> Path:
+    """Return a hidden path by a dataset: its `lock`, `partial` while it is written, `old` while it is replaced."""
     return path.with_name(f".offbench-{path.name}.{ending}")
 
 
-OLD = re.compile(r"\.offbench-([^.].*)\.old")  # of `beside`
+REPLACED = re.compile(r"\.offbench-([^.].*)\.old")  # of `hidden_path`
 
 
-def _put_back(path: Path) -> bool:
-    """Put back a dataset whose writer was killed between the two renames of `write`; return whether it is there."""
-    if os.path.lexists(beside(path, "old")):
-        _tidy(path, ORPHANS)
+def _restore_replaced(path: Path) -> bool:
+    """Restore a dataset whose writer was killed between the two renames of `write`; return whether it exists."""
+    if os.path.lexists(hidden_path(path, "old")):
+        _tidy(path, LOCK_TIMEOUT)
     return path.exists()
 
 
 @contextlib.contextmanager
 def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
-    """Hold a dataset id for writing; yields its folder.
+    """Lock a dataset id for writing; yields its folder.
 
     Raises:
         OffbenchError: the id is taken (and `overwrite` is not set), another process is recording it, or the
@@ -265,7 +265,7 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     path = path_of(dataset_id)
     if not path.parent.resolve().is_relative_to(root().resolve()):
         raise OffbenchError(f"{dataset_id} leads out of {root()} by a link; choose another id")
-    with exclusive_lock(beside(path, "lock"), f"{dataset_id} is being recorded"):
+    with exclusive_lock(hidden_path(path, "lock"), f"{dataset_id} is being recorded"):
         with disk_errors(str(path)):
             recover(path)
         if path.exists() and not overwrite:
@@ -283,27 +283,27 @@ def _size(dataset_id: str) -> str:
 
 
 def tidy(dataset_id: str) -> None:
-    """Delete what a killed process left beside a dataset, unless one is at work on it or the folder is read-only."""
+    """Delete a killed process's leftovers of a dataset, unless it is being written or the folder is read-only."""
     _tidy(path_of(dataset_id), 0)
 
 
 def _tidy(path: Path, timeout: float) -> None:
     with (
         contextlib.suppress(OffbenchError),
-        exclusive_lock(beside(path, "lock"), path.name, timeout),
+        exclusive_lock(hidden_path(path, "lock"), path.name, timeout),
         disk_errors(str(path)),
     ):
         recover(path)
 
 
 def recover(path: Path) -> None:
-    """Put the replaced dataset back if the new one did not make it, else delete it; delete what is half written."""
-    old, partial = beside(path, "old"), beside(path, "partial")
+    """Restore a replaced dataset if the new one is incomplete, else delete it; delete incomplete files."""
+    old, partial = hidden_path(path, "old"), hidden_path(path, "partial")
     with disk_errors(str(partial)):
         delete(partial)
     with disk_errors(str(old)):
         if not path.exists() and not old.is_symlink() and (old / "data" / "metadata.json").is_file():
             old.replace(path)
         elif os.path.lexists(old):
-            old.replace(partial)  # a killed process must not leave half of it as a dataset to put back
+            old.replace(partial)  # so that a killed process leaves no half of it to restore
             delete(partial)

@@ -1,4 +1,4 @@
-"""Writes episodes as a Minari dataset: aside, then renamed, so that an id never names half a dataset."""
+"""Writes episodes as a Minari dataset: to a temporary folder, renamed once it is complete."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, check_ownership, disk_errors, write_bytes
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.data.content_hash import ContentHash
-from offbench.data.minari_store import KEY, beside, recover, root
+from offbench.data.minari_store import KEY, hidden_path, recover, root
 from offbench.envs.environments import Space, parse_spec
 from offbench.rollouts.rollouts import Episode
 
@@ -39,27 +39,27 @@ def write(
     """Write episodes as a Minari HDF5 dataset at `path`, whole or not at all; return the content hash.
 
     Args:
-        path: the folder of a claimed id; what is there is replaced at the last moment.
+        path: the folder of a claimed id; an existing dataset is replaced at the end.
         spec: the environment's EnvSpec as JSON, None if unknown.
         metadata: Minari's fields; the content hash joins those under the key `offbench`.
-        steps: transitions to come, to see beforehand whether the disk has room.
+        steps: the expected transitions, to check that the disk has room.
         spaces: of observations and actions; Minari would otherwise make the environment, which may no longer exist.
         expected: the content hash that the data must have (None: any).
     """
     env_spec = parse_spec(spec) if spec else None
-    aside = beside(path, "partial")
-    check_ownership(aside)
+    temporary = hidden_path(path, "partial")
+    check_ownership(temporary)
     with disk_errors(str(path)):
-        (aside / "data").mkdir(parents=True)
+        (temporary / "data").mkdir(parents=True)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                storage = MinariStorage.new(aside / "data", *spaces, env_spec, "hdf5")
-            _check_room(aside, storage, steps)
+                storage = MinariStorage.new(temporary / "data", *spaces, env_spec, "hdf5")
+            _check_room(temporary, storage, steps)
             content, dtype = ContentHash(), storage.observation_space.dtype
-            with safe_file(storage._file_path) as storage._file_path:  # so that a full disk is no crash
-                storage.update_episodes(_buffers(episodes, dtype, content, storage._file_path, aside))
-            check_ownership(aside)
+            with safe_file(storage._file_path) as storage._file_path:  # a full disk must not crash libhdf5
+                storage.update_episodes(_buffers(episodes, dtype, content, storage._file_path, temporary))
+            check_ownership(temporary)
             if not storage.total_steps:
                 raise OffbenchError("there are no transitions to write")
             if expected not in (None, content.hexdigest()):
@@ -69,17 +69,19 @@ def write(
             ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
             storage.update_metadata(metadata | {KEY: ours})
             _write_namespaces(path)
-            check_ownership(aside)
+            check_ownership(temporary)
             if path.exists():
-                path.replace(beside(path, "old"))
-            aside.replace(path)
+                path.replace(hidden_path(path, "old"))
+            temporary.replace(path)
         except Exception as error:  # Minari raises a ValueError for a missing folder, for example
-            if aside.exists():
+            if temporary.exists():
                 raise
-            raise OffbenchError(f"{aside} was moved or deleted while it was written; run the command again") from error
+            raise OffbenchError(
+                f"{temporary} was moved or deleted while it was written; run the command again"
+            ) from error
         finally:
             with contextlib.suppress(OffbenchError):  # the folder is no longer this process's, or the disk refuses
-                check_ownership(aside)
+                check_ownership(temporary)
                 recover(path)
     return content.hexdigest()
 
@@ -115,7 +117,7 @@ def _buffers(
 
 
 def _check_room(folder: Path, storage: MinariStorage, steps: int) -> None:
-    """Refuse to begin what the disk cannot hold (episodes of 100 steps assumed)."""
+    """Raise OffbenchError if the disk has no room for the dataset (episodes of 100 steps assumed)."""
     width = storage.observation_space.shape[0] * storage.observation_space.dtype.itemsize
     width += storage.action_space.shape[0] * 4 + 10
     need = steps * width + steps // 100 * BYTES_PER_EPISODE

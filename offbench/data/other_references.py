@@ -13,7 +13,7 @@ from offbench.envs.recipes import Recipe
 
 
 def warn_other_references(recipe: Recipe, ladder: Ladder) -> None:
-    """Say which datasets of an environment were recorded with other references than its ladder has now."""
+    """Warn about datasets of an environment that have other references than its ladder now."""
     wanted = _scale(ladder.info.references)
     others = []
     for dataset_id in minari_store.local_ids():

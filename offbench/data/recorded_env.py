@@ -13,7 +13,7 @@ from offbench.common.terminal import inform
 from offbench.data import minari_store
 from offbench.envs import environments
 from offbench.envs.environments import Env, untrusted_env
-from offbench.envs.margin_rule import ADDED, EARLIER, SINCE, with_margin
+from offbench.envs.margin_rule import ADDED, EARLIER, MUJOCO_VERSIONS, with_margin
 from offbench.envs.recipes import load_recipe, names
 
 CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d{1,6})(?:\.(\d{1,6}))?")  # of a requirement: `>=3.1.0,<3.2.0` has two
@@ -36,7 +36,7 @@ def make_env(name: str, render_mode: str | None = None) -> Env:
     if spec is None:
         raise OffbenchError(f"{name} names no environment; give the name or the file of a recipe instead")
     untrusted_env(spec, name).close()
-    say_margin(name, metadata, spec)
+    report_margin_rule(name, metadata, spec)
     return environments.make_env(spec, render_mode)
 
 
@@ -68,7 +68,7 @@ def _requirements(metadata: JsonObject) -> list[str]:
 
 
 def recorded_mujoco(metadata: JsonObject) -> str | None:
-    """Return the MuJoCo version a dataset was recorded with: ours, or what a requirement pins; None if unknown."""
+    """Return the MuJoCo version that a dataset records, or that a requirement pins; None if unknown."""
     if made := minari_store.provenance(metadata).versions.get("mujoco"):
         return made
     pinned = (re.fullmatch(r"mujoco\s*==\s*([\w.]+)", item) for item in _requirements(metadata))
@@ -85,16 +85,15 @@ def margins_matter(spec: str) -> bool:
     return model is not None and has_margins(model)
 
 
-def say_margin(dataset_id: str, metadata: JsonObject, spec: str) -> None:
-    """Say which rule a dataset's environment (EnvSpec JSON) is made with, where that is not plain."""
+def report_margin_rule(dataset_id: str, metadata: JsonObject, spec: str) -> None:
+    """Print the contact-margin rule of a dataset's environment (EnvSpec JSON), unless it is the default or unused."""
     rule = recorded_margin(metadata)
     if rule == EARLIER or not margins_matter(spec):
         return
-    words = (
-        f"{dataset_id}: contact margins as in MuJoCo {SINCE[rule or EARLIER]} (installed is {versions()['mujoco']})"
-    )
+    since, installed = MUJOCO_VERSIONS[rule or EARLIER], versions()["mujoco"]
+    message = f"{dataset_id}: contact margins as in MuJoCo {since} (installed is {installed})"
     if rule is None:
-        words += f"; its metadata do not tell, `offbench verify {dataset_id}` finds out"
+        message += f"; its metadata do not tell, `offbench verify {dataset_id}` finds out"
     else:
-        words += ", which recorded it"
-    inform(words)
+        message += ", which recorded it"
+    inform(message)

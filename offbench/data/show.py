@@ -12,7 +12,7 @@ from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
 from offbench.common.scores import normalize
-from offbench.common.settings import shown
+from offbench.common.settings import short_repr
 from offbench.data import minari_store, transitions
 
 BINS = 12
@@ -21,7 +21,7 @@ BAR = 40
 
 @dataclass(frozen=True, repr=False)
 class Summary:
-    """What is in a dataset: `lines()` for a terminal, `plot(path)` for a picture."""
+    """The contents of a dataset: `lines()` for a terminal, `plot(path)` for a figure."""
 
     dataset_id: str
     metadata: JsonObject
@@ -48,11 +48,11 @@ class Summary:
         lines += ["", *_histogram(self.returns), ""]
         lines.append("provenance")
         for part in ours.parts or ():
-            lines += ["part", *(f"  {key:<13} {fact(value)}" for key, value in part.items())]
-        told = {name: getattr(ours, name) for name in ("env", "level", "seed", "content_sha256", "recipe_sha256")}
-        told["imported from"] = ours.imported.get("file")
-        told["versions"] = ", ".join(f"{name} {version}" for name, version in ours.versions.items()) or None
-        shown = [f"{key:<15} {fact(value)}" for key, value in told.items() if value is not None]
+            lines += ["part", *(f"  {key:<13} {format_value(value)}" for key, value in part.items())]
+        origin = {name: getattr(ours, name) for name in ("env", "level", "seed", "content_sha256", "recipe_sha256")}
+        origin["imported from"] = ours.imported.get("file")
+        origin["versions"] = ", ".join(f"{name} {version}" for name, version in ours.versions.items()) or None
+        shown = [f"{key:<15} {format_value(value)}" for key, value in origin.items() if value is not None]
         lines += shown or ["not recorded by offbench"]
         return [" ".join(line.splitlines()) for line in lines]  # a line break in a text would begin a line of its own
 
@@ -61,7 +61,7 @@ class Summary:
         return f"Summary({self.dataset_id}, {len(self.returns):,} episodes; `lines()` has more)"
 
     def plot(self, path: str | Path) -> Path:
-        """Draw the histogram of returns. Raises OffbenchError if the picture cannot be written."""
+        """Draw the histogram of returns. Raises OffbenchError if the figure cannot be written."""
         from offbench.common.plotting import figure, picture_file, save
 
         path = picture_file(path)
@@ -85,12 +85,12 @@ def show(dataset_id: str) -> Summary:
     return Summary(dataset_id, data.metadata, np.asarray(data.returns), lengths, terminated)
 
 
-def fact(value: object) -> str:
+def format_value(value: object) -> str:
     """Return a value of the metadata as text."""
     if isinstance(value, bool) or not isinstance(value, int | float | list):
         return str(value)
     if isinstance(value, list):
-        return " to ".join(shown(item) if isinstance(item, list) else fact(item) for item in value)
+        return " to ".join(short_repr(item) if isinstance(item, list) else format_value(item) for item in value)
     return f"{value:,}" if isinstance(value, int) else f"{value:,.4g}" if abs(value) < 100 else f"{value:,.1f}"
 
 

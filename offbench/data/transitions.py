@@ -41,8 +41,8 @@ from offbench.common.progress import Progress
 from offbench.common.terminal import warn
 from offbench.data import minari_store
 from offbench.data.content_hash import ContentHash
-from offbench.data.file_stamps import ReplacedError, Stamps, checked, recorded, unchanged
-from offbench.data.minari_reader import check_storage, flags, float32, open_parsed, reading, shape_faults
+from offbench.data.file_stamps import ReplacedError, Stamps, check_files, hash_and_stamp, unchanged
+from offbench.data.minari_reader import check_storage, flags, float32, open_unchecked, reading, shape_faults
 from offbench.data.recorded_env import evaluation_spec
 from offbench.envs.environments import action_box, box, same_environment
 
@@ -52,13 +52,13 @@ if TYPE_CHECKING:
 ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
 ATTEMPTS = 3  # to read a dataset that is replaced meanwhile
 NUMBERS = ("observations", "actions", "rewards")
-LEAST_USED = 1e-3  # of the range between the action bounds
-CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding are worth a warning
+LEAST_USED_RANGE = 1e-3  # share of the range between the action bounds that actions should use
+CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding cause a warning
 
 
 @dataclass(frozen=True, repr=False)
 class Transitions:
-    """A dataset as flat arrays, mapped from the cache (see the module's drawing)."""
+    """A dataset as flat arrays, memory-mapped from the cache (layout: offbench.data.transitions)."""
 
     dataset_id: str
     content: str  # SHA-256 over the arrays, the same as in an offbench dataset's metadata
@@ -138,22 +138,22 @@ def load(dataset_id: str) -> Transitions:
 def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     metadata = minari_store.read_metadata(dataset_id)
     expected = minari_store.provenance(metadata).content_sha256
-    data = open_parsed(dataset_id)
+    data = open_unchecked(dataset_id)
     observation_space = box(data.observation_space, f"{dataset_id}: observations")
     action_space = action_box(data.action_space, f"{dataset_id}: actions")
     folder = cache() / _key(dataset_id, expected, stamps)
     sources = {f"data/{name}": minari_store.path_of(dataset_id) / "data" / name for name in stamps}
-    cached = _mapped(folder, sources)
+    cached = _read_converted(folder, sources)
     if cached is None:
         with disk_errors(str(folder), "set OFFBENCH_CACHE to another folder"):
             folder.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(folder.with_name(f"{folder.name}.lock")):
-                cached = _mapped(folder, sources)  # another process may have converted it meanwhile
+                cached = _read_converted(folder, sources)  # another process may have converted it meanwhile
                 if cached is None:
                     with unchanged(dataset_id):
-                        aside = _convert(data, dataset_id, observation_space, action_space, folder, sources)
-                    aside.replace(folder)
-                    cached = _mapped(folder, sources)
+                        temporary = _convert(data, dataset_id, observation_space, action_space, folder, sources)
+                    temporary.replace(folder)
+                    cached = _read_converted(folder, sources)
     if cached is None:
         raise OffbenchError(f"cannot read back {folder}; delete it and try again")
     content, arrays = cached[0], dict[str, Any](cached[1])
@@ -161,7 +161,7 @@ def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     return Transitions(dataset_id, content, **arrays, low=action_space.low, high=action_space.high, metadata=metadata)
 
 
-def _mapped(folder: Path, sources: Mapping[str, Path]) -> tuple[str, dict[str, Array]] | None:
+def _read_converted(folder: Path, sources: Mapping[str, Path]) -> tuple[str, dict[str, Array]] | None:
     """Return the content hash and the arrays of a converted dataset.
 
     None if it is not there, is damaged, or was converted from other files than `sources` are now.
@@ -173,7 +173,7 @@ def _mapped(folder: Path, sources: Mapping[str, Path]) -> tuple[str, dict[str, A
         with damage(str(folder), "is damaged", "it is converted again"):
             meta = json.loads(read_text(folder / "meta.json"))
             paths = {**sources, **{f"{name}.npy": folder / f"{name}.npy" for name in ARRAYS}}
-            files = checked(paths, meta["files"])
+            files = check_files(paths, meta["files"])
             arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ARRAYS}
             content = str(meta["content_sha256"])
     except (FileNotFoundError, DamagedError):
@@ -234,48 +234,48 @@ def _convert(
     # each earlier episode put one extra observation row (its last) before this transition
     arrays["rows"] = np.arange(ends[-1]) + np.repeat(np.arange(len(lengths)), lengths)
     arrays |= {"ends": ends, "returns": np.array(returns)}
-    aside = folder.with_name(f".{folder.name}.tmp")
+    temporary = folder.with_name(f".{folder.name}.tmp")
     source = str(minari_store.path_of(dataset_id))
-    _forget(source)
+    _delete_earlier_conversions(source)
     _remove_leftovers(folder)
-    aside.mkdir()
+    temporary.mkdir()
     try:
-        files = {name: recorded(path) for name, path in sources.items()}
+        files = {name: hash_and_stamp(path) for name, path in sources.items()}
         for name in ARRAYS:
-            with open(aside / f"{name}.npy", "wb") as file:
+            with open(temporary / f"{name}.npy", "wb") as file:
                 np.save(file, arrays[name], allow_pickle=False)
                 file.flush()
                 os.fsync(file.fileno())
-            files[f"{name}.npy"] = recorded(aside / f"{name}.npy")
+            files[f"{name}.npy"] = hash_and_stamp(temporary / f"{name}.npy")
         meta = {"source": source, "content_sha256": content.hexdigest(), "files": files}
-        write_json(aside / "meta.json", meta)
+        write_json(temporary / "meta.json", meta)
         delete(folder)
     except BaseException:
-        shutil.rmtree(aside, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
         raise
-    return aside
+    return temporary
 
 
-def _forget(source: str) -> None:
+def _delete_earlier_conversions(source: str) -> None:
     """Delete what was converted from an earlier content of the same dataset."""
     for meta in cache().glob("*/meta.json"):
-        with contextlib.suppress(OffbenchError):  # of another dataset, and damaged
+        with contextlib.suppress(OffbenchError):  # another dataset's, which is damaged
             if read_json(meta).get("source") == source:
-                aside = meta.parent.with_name(f".{meta.parent.name}.old")  # which `_remove_leftovers` knows
+                temporary = meta.parent.with_name(f".{meta.parent.name}.old")  # which `_remove_leftovers` knows
                 with contextlib.suppress(OSError):
-                    meta.parent.replace(aside)
-                    shutil.rmtree(aside)
+                    meta.parent.replace(temporary)
+                    shutil.rmtree(temporary)
 
 
 def _remove_leftovers(folder: Path) -> None:
     """Delete what killed processes left of their conversions: `folder`'s, whose lock is held, and those unlocked."""
-    for aside in folder.parent.glob(".*"):
-        key = aside.name[1:].partition(".")[0]
+    for temporary in folder.parent.glob(".*"):
+        key = temporary.name[1:].partition(".")[0]
         if key == folder.name:
-            delete(aside)
-        elif len(key) == len(folder.name) and aside.is_dir():
-            with contextlib.suppress(Timeout, OSError), FileLock(aside.with_name(f"{key}.lock"), timeout=0):
-                shutil.rmtree(aside, ignore_errors=True)
+            delete(temporary)
+        elif len(key) == len(folder.name) and temporary.is_dir():
+            with contextlib.suppress(Timeout, OSError), FileLock(temporary.with_name(f"{key}.lock"), timeout=0):
+                shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _episodes(data: MinariDataset, dataset_id: str) -> Iterator[EpisodeData]:
@@ -301,7 +301,7 @@ def _scaled(actions: Array, space: gym.spaces.Box, dataset_id: str) -> Array:
     outside = int((np.abs(scaled) > 1 + CLIP_TOLERANCE).any(1).sum())
     if outside:
         warn(f"{dataset_id}: {outside} actions out of bounds were clipped")
-    if 0 < (used := float((scaled.max(0) - scaled.min(0)).max()) / 2) < LEAST_USED:
+    if 0 < (used := float((scaled.max(0) - scaled.min(0)).max()) / 2) < LEAST_USED_RANGE:
         warn(
             f"{dataset_id}: actions use {used:.1g} of the range between the action space's bounds, "
             "which policies can hardly resolve; correct the action space to what the environment takes"

@@ -9,10 +9,11 @@ A contact's margin and gap come from those of its two geoms:
 
 For `max` on newer versions, geoms that all have the margin m, as in Gymnasium's Hopper and Ant, get m / 2. Margins
 that differ are replaced by values h with h1 + h2 = max(m1, m2) for every pair of geoms that can collide, if such
-values exist. For `sum` on older versions, by values h with max(h1, h2) = m1 + m2. On newer ones it is MuJoCo's own.
+values exist. For `sum` on older versions, they are replaced by values h with max(h1, h2) = m1 + m2. Newer
+versions have this rule themselves.
 
-Not undone: since 4.0, the RK4 integrator rotates free and ball joints with fourth-order accuracy, before with second.
-No model option restores that. Of the shipped environments it affects only Ant.
+One difference remains: since 4.0, the RK4 integrator rotates free and ball joints with fourth-order accuracy, before
+with second. No model option restores that. Of the shipped environments it affects only Ant.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.terminal import warn
-from offbench.envs.margin_rule import ADDED, EARLIER, SINCE
+from offbench.envs.margin_rule import ADDED, EARLIER, MUJOCO_VERSIONS
 
 SUMMED_SINCE, GAP_OUTSIDE_SINCE, RK4_ROTATIONS_SINCE = (3, 5), (3, 9), (4, 0)
 ROUNDING = 1e-12  # of a sum of two margins, in the model's unit of length
@@ -40,10 +41,10 @@ def release(version: str) -> tuple[int, int]:
 
 
 def set_contacts(model: mujoco.MjModel, rule: str, name: str) -> None:
-    """Give a freshly loaded model the contacts of a rule, `max` or `sum`; if that fails, leave it and print a warning.
+    """Set the contact margins of a newly loaded model by a rule, `max` or `sum`; warn if no margins reproduce it.
 
     Args:
-        name: what a warning calls the model.
+        name: the model's name in a warning.
     """
     here = release(mujoco.__version__)
     if rule == (ADDED if here >= SUMMED_SINCE else EARLIER):
@@ -77,14 +78,14 @@ def _warn_once(name: str, rule: str) -> None:
         remedy = "mujoco<3.5" if rule == EARLIER else "mujoco>=3.5"
         warn(
             f"{name}: no contact margins on MuJoCo {mujoco.__version__} give the contacts of "
-            f"versions {SINCE[rule]}, so the model keeps its own; for those, install '{remedy}'"
+            f"versions {MUJOCO_VERSIONS[rule]}, so the model keeps its own; for those, install '{remedy}'"
         )
 
 
 def rotations_changed(model: mujoco.MjModel) -> bool:
-    """Return whether a model moves differently since MuJoCo 4.0: RK4 with a free or ball joint."""
-    turning = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
-    return bool(model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and np.isin(model.jnt_type, turning).any())
+    """Return whether MuJoCo 4.0 and later simulate a model differently: RK4 with a free or ball joint."""
+    rotating = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+    return bool(model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and np.isin(model.jnt_type, rotating).any())
 
 
 def model_of(env: gym.Env[Array, Array]) -> mujoco.MjModel | None:

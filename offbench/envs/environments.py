@@ -21,7 +21,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
-from offbench.common.errors import OffbenchError, drawing_variable
+from offbench.common.errors import OffbenchError, rendering_variable
 from offbench.common.files import is_exhausted
 from offbench.common.terminal import warn
 from offbench.envs.margin_rule import EARLIER, MARGIN, without_margin
@@ -30,9 +30,9 @@ from offbench.envs.trust import check_code
 Env: TypeAlias = gym.Env[Array, Array]
 Space: TypeAlias = gym.Space[Any]
 IDENTITY = ("id", "kwargs", "max_episode_steps")  # specs that agree in these and in the contact margins are the same
-LARGEST_BOUND = 1e6  # of actions; larger ones, such as float32's largest number, count as none
-LONGEST = 20_000  # steps that an episode may take in an environment without a time limit
-LARGEST_LIMIT = 1_000_000  # a time limit beyond this is none
+LARGEST_BOUND = 1e6  # largest action bound; larger ones, such as float32's maximum, count as unbounded
+LONGEST_EPISODE = 20_000  # steps that an episode may take in an environment without a time limit
+LARGEST_LIMIT = 1_000_000  # a larger time limit counts as none
 OTHER_ENV = "give the right environment with --env RECIPE"
 
 
@@ -40,7 +40,7 @@ def env_spec(env_id: str, **kwargs: Any) -> str:
     """Return Gymnasium's EnvSpec of `env_id` as JSON, checked to have flat Box spaces and bounded actions.
 
     Raises:
-        OffbenchError: it cannot be made, or its spaces are of another kind.
+        OffbenchError: the environment cannot be made, or has other spaces.
     """
     try:
         with _quiet_loading(env_id):
@@ -56,7 +56,7 @@ def env_spec(env_id: str, **kwargs: Any) -> str:
         raise OffbenchError(f"cannot make the environment {env_id!r}: {reason(error).rstrip('.')}{hint}") from error
     _check_importable(env.spec)
     spaces_of(env, env_id)
-    _warn_endless(env_id, env.spec)
+    _warn_no_time_limit(env_id, env.spec)
     return text
 
 
@@ -76,7 +76,7 @@ def checked_spec(text: str, where: str, observation_dim: int, low: Array, high: 
     """
     with contextlib.suppress(Exception):  # untrusted_env reports what is wrong with it
         spec = parse_spec(text)
-        _warn_endless(spec.id, spec)
+        _warn_no_time_limit(spec.id, spec)
     try:
         env = untrusted_env(text, where)
         observations, actions = spaces_of(env, where)
@@ -140,7 +140,7 @@ def untrusted_env(text: str, where: str) -> Env:
 
 
 def _check_importable(spec: EnvSpec | None) -> None:
-    """Refuse an environment of the script itself: worker processes could not make it."""
+    """Refuse an environment that is defined in the script itself: worker processes cannot import it."""
     points = [spec.entry_point, *(wrapper.entry_point for wrapper in spec.additional_wrappers)] if spec else []
     if spec and any(str(point).startswith("__main__:") for point in points):
         raise OffbenchError(
@@ -157,21 +157,21 @@ def time_limit(spec: EnvSpec | None) -> int | None:
     return limit if isinstance(limit, int) and 0 < limit <= LARGEST_LIMIT else None
 
 
-def _warn_endless(name: str, spec: EnvSpec | None) -> None:
+def _warn_no_time_limit(name: str, spec: EnvSpec | None) -> None:
     """Warn once about an environment without a time limit, in which an episode may never end."""
-    if time_limit(spec) is None and name not in _endless and multiprocessing.parent_process() is None:
-        _endless.add(name)
+    if time_limit(spec) is None and name not in _warned_no_time_limit and multiprocessing.parent_process() is None:
+        _warned_no_time_limit.add(name)
         warn(
             f"{name} has no time limit (max_episode_steps): an episode that does not end within "
-            f"{LONGEST:,} steps is an error"
+            f"{LONGEST_EPISODE:,} steps is an error"
         )
 
 
-_endless: set[str] = set()  # environments that a warning was printed for
+_warned_no_time_limit: set[str] = set()  # environments that a warning was printed for
 
 
 def make_env(spec: str, render_mode: str | None = None) -> Env:
-    """Make the environment of an EnvSpec in JSON, without the step-by-step checker, with the contacts it asks for."""
+    """Make the environment of an EnvSpec (JSON) with its contact margins, without Gymnasium's environment checker."""
     plain, rule = without_margin(spec)
     made = EnvSpec.from_json(plain)
     made.disable_env_checker = True
@@ -200,14 +200,14 @@ def _quiet_loading(env_id: str) -> Iterator[None]:
     import mujoco
 
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(_say_unless_deprecated)
+    mujoco.set_mju_user_warning(_warn_unless_deprecated)
     try:
         yield
     finally:
         mujoco.set_mju_user_warning(before)
 
 
-def _say_unless_deprecated(warning: str) -> None:
+def _warn_unless_deprecated(warning: str) -> None:
     if "deprecated" not in warning:
         warn(f"MuJoCo: {warning.strip()}")
 
@@ -217,11 +217,11 @@ def _cache_health(env: Env) -> None:
 
     Their step reads it twice, for the reward and for the termination, and each time takes a tenth of the step.
     """
-    kind: Any = type(env)
-    if not (kind.__module__.startswith("gymnasium.envs.mujoco.") and hasattr(kind, "is_healthy")):
+    cls: Any = type(env)
+    if not (cls.__module__.startswith("gymnasium.envs.mujoco.") and hasattr(cls, "is_healthy")):
         return
 
-    class CachedHealth(kind):  # type: ignore[misc]
+    class CachedHealth(cls):  # type: ignore[misc]
         _healthy: bool | None = None
 
         @property
@@ -251,14 +251,14 @@ def same_environment(a: str | None, b: str | None) -> bool:
 
 
 def reason(error: BaseException) -> str:
-    """Return the first line of an exception's text, or its kind."""
+    """Return the first line of an exception's text, or its type."""
     lines = str(error).strip().splitlines()
     return lines[0] if lines else type(error).__name__
 
 
 def _remedy(error: BaseException) -> str:
-    """Return what to do about an environment that cannot be made, "" where nothing general helps."""
-    if variable := drawing_variable(error):
+    """Return what to do about an environment that cannot be made, "" if there is no general advice."""
+    if variable := rendering_variable(error):
         return f"; unset {variable}"
     package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     if package and importlib.util.find_spec(package) is None:

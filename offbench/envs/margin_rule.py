@@ -7,13 +7,13 @@ import json
 from offbench.common.errors import OffbenchError
 
 MARGIN = "contact_margin"
-EARLIER, ADDED = "max", "sum"  # the larger margin of two geoms, or both together
-OUTDATED = ("apply_api_compatibility", "autoreset")  # fields of Gymnasium before 1.0, which later ones refuse
-SINCE = {EARLIER: "before 3.5", ADDED: "3.5 and later"}  # the MuJoCo versions whose rule it is
+EARLIER, ADDED = "max", "sum"  # a contact's margin: the larger of its geoms' two, or their sum
+REMOVED_FIELDS = ("apply_api_compatibility", "autoreset")  # fields of Gymnasium before 1.0, which later ones refuse
+MUJOCO_VERSIONS = {EARLIER: "before 3.5", ADDED: "3.5 and later"}  # that have each rule
 
 
 def with_margin(spec: str, rule: str) -> str:
-    """Return an EnvSpec (JSON) with the rule for contact margins that its environment is to have."""
+    """Return an EnvSpec (JSON) that names the rule for contact margins."""
     plain = without_margin(spec)[0]
     return plain if rule == EARLIER else json.dumps(json.loads(plain) | {MARGIN: rule})
 
@@ -22,11 +22,11 @@ def without_margin(spec: str) -> tuple[str, str]:
     """Return Gymnasium's own EnvSpec (JSON), and the rule for contact margins.
 
     Raises:
-        OffbenchError: there is no such rule.
+        OffbenchError: the EnvSpec names an unknown rule.
     """
     fields = json.loads(spec)
     rule = fields.pop(MARGIN, EARLIER)
     if rule not in (EARLIER, ADDED):
         raise OffbenchError(f"{MARGIN} must be {EARLIER} or {ADDED}, not {rule!r}")
-    plain = {name: value for name, value in fields.items() if name not in OUTDATED}
+    plain = {name: value for name, value in fields.items() if name not in REMOVED_FIELDS}
     return (spec if plain == fields and MARGIN not in spec else json.dumps(plain)), rule

@@ -1,7 +1,7 @@
-"""Recipes: all that is particular to one environment, in one TOML file.
+"""Recipes: everything specific to one environment, in one TOML file.
 
 A shipped recipe is named by its folder (`hopper`), any other by the path of its file (`./my-env.toml`).
-Algorithms and levels know no environment by name.
+Algorithms and levels do not depend on the names of environments.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import TypeVar
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import damage, read_text
 from offbench.common.scores import are_references
-from offbench.common.settings import build, setting, shown
+from offbench.common.settings import build, setting, short_repr
 from offbench.envs.environments import env_spec
 from offbench.envs.margin_rule import ADDED, EARLIER, with_margin
 
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class SACSettings:
-    """How the behaviour agent is trained: Stable-Baselines3's SAC and the ladder kept of it."""
+    """Settings of the behaviour agent: Stable-Baselines3's SAC, and the ladder of its policies."""
 
     steps: int = setting(1_000_000, "environment steps of the whole training", low=1)
     segment: int = setting(10_000, "environment steps between two rungs (and checkpoints)", low=1)
@@ -45,14 +45,14 @@ class SACSettings:
     rung_episodes: int = setting(5, "episodes that screen each rung, stochastic and deterministic each", low=2)
 
     def cycle(self) -> tuple[int, int]:
-        """Return (vectorized steps, gradient steps) of one turn of the training loop, both whole numbers."""
+        """Return (vectorized steps, gradient steps) of one iteration of the training loop, both whole numbers."""
         ratio = Fraction(self.gradient_steps * self.envs).limit_denominator(64)
         return ratio.denominator, ratio.numerator
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """How many episodes stand behind published numbers."""
+    """Numbers of episodes and policies that are measured."""
 
     rung_episodes: int = setting(100, "episodes behind the return of a chosen rung", low=2)
     reference_episodes: int = setting(200, "episodes behind each reference score", low=2)
@@ -85,7 +85,7 @@ class Recipe:
         return with_margin(env_spec(self.env_id, **dict(self.env_kwargs)), self.contact_margin)
 
     def sha256(self) -> str:
-        """Return a hash over everything the recipe says (not over its layout or comments)."""
+        """Return the SHA-256 of the recipe's values, which its layout and comments do not affect."""
         values = {k: v for k, v in dataclasses.asdict(self).items() if k != "folder"}
         for name, default in (("contact_margin", EARLIER), ("replay_envs", None)):
             if values[name] == default:
@@ -146,7 +146,7 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
 
 def _table(value: object, key: str, where: str) -> dict[str, object]:
     if not isinstance(value, dict):
-        raise OffbenchError(f"{where}: {key} must be a table, not {shown(value)}")
+        raise OffbenchError(f"{where}: {key} must be a table, not {short_repr(value)}")
     return value
 
 
@@ -155,8 +155,8 @@ def _kwargs(value: object, where: str) -> tuple[tuple[str, object], ...]:
     try:
         json.dumps(table)
     except (TypeError, ValueError, RecursionError):  # a date, a number of 5000 digits
-        words = "numbers, text, true, false, lists and tables"
-        raise OffbenchError(f"{where}: env_kwargs may hold {words} only") from None
+        allowed = "numbers, text, true, false, lists and tables"
+        raise OffbenchError(f"{where}: env_kwargs may hold {allowed} only") from None
     return tuple(sorted(table.items()))
 
 
@@ -183,8 +183,8 @@ def _check(recipe: Recipe, where: str) -> None:
 D4RL_TASK = re.compile(r"(\w+)-v[2-5]", re.ASCII)
 D4RL_CODE = ("gymnasium.envs.mujoco", "gym.envs.mujoco")
 D4RL_LIMIT = 1000  # steps of an episode of D4RL's MuJoCo tasks
-WATCHING = {"OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics"}  # wrappers that change nothing
-VIEW = {"render_mode", "width", "height", "camera_id", "camera_name", "default_camera_config"}
+PASSIVE_WRAPPERS = {"OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics"}  # wrappers that change nothing
+RENDERING_ARGUMENTS = {"render_mode", "width", "height", "camera_id", "camera_name", "default_camera_config"}
 
 
 def d4rl_reference(spec: str | None) -> tuple[float, float] | None:
@@ -202,7 +202,7 @@ def d4rl_reference(spec: str | None) -> tuple[float, float] | None:
     standard = (
         str(fields.get("entry_point")).startswith(D4RL_CODE)
         and fields.get("max_episode_steps") == D4RL_LIMIT
-        and not (fields.get("kwargs") or {}).keys() - VIEW
-        and wrappers <= WATCHING
+        and not (fields.get("kwargs") or {}).keys() - RENDERING_ARGUMENTS
+        and wrappers <= PASSIVE_WRAPPERS
     )
     return (recipe.d4rl_min, recipe.d4rl_max) if standard else None

@@ -1,7 +1,7 @@
-"""The gate for environments that a file names: what may be imported and made, and with which arguments.
+"""Checks of environments that a file names: what may be imported and made, and with which arguments.
 
-A dataset, run or policy names the code that makes its environment. That is judged by name, before anything is
-imported. Recipes are the user's own and do not pass here.
+A dataset, run or policy names the code that makes its environment. It is checked by name, before anything is
+imported. Recipes are the user's own and are not checked.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import environment
-from offbench.common.settings import shown
+from offbench.common.settings import short_repr
 
 VARIABLE = "OFFBENCH_TRUST"
 REMEDY = f"if you trust where it is from, add --trust ({VARIABLE}=1 in Python)"
-# whose environments may be made, registered or not; imported D4RL files name gym's
+# packages whose environments need not be registered; imported D4RL files name gym's
 PACKAGES = ("gymnasium.envs.", "gymnasium_robotics.envs.", "gym.envs.")
 DISTRIBUTIONS = {"gymnasium": "gymnasium", "gymnasium_robotics": "gymnasium-robotics", "gym": "gym"}
 # of gymnasium.wrappers: those for flat spaces that write no file, open no window and take no function
@@ -52,11 +52,11 @@ WRAPPERS = {
     "TimeLimit",
 }
 ENTRY_POINT = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)", re.ASCII)
-LARGEST = 10_000  # whole number among arguments: frame_skip = 2e9 would never return
-REPEATING = ("frame_skip", "num_repeats", "skip", "stack_size", "delay")  # arguments whose effects multiply
-MOST = 10_000  # values in all arguments together
-DEEPEST = 10
-LONGEST = 200  # characters of a text
+LARGEST_ARGUMENT = 10_000  # whole number among arguments: frame_skip = 2e9 would never return
+MULTIPLYING = ("frame_skip", "num_repeats", "skip", "stack_size", "delay")  # arguments whose effects multiply
+MOST_VALUES = 10_000  # values in all arguments together
+DEEPEST_NESTING = 10
+LONGEST_TEXT = 200  # characters of a text
 
 
 @contextlib.contextmanager
@@ -85,19 +85,21 @@ def check_code(spec: EnvSpec) -> None:
     if not is_trusting():
         limit = spec.max_episode_steps
         if limit is not None and (type(limit) is not int or not (limit > 0 or limit == -1)):  # -1: no limit
-            raise OffbenchError(f"its time limit is {shown(limit)}, not a number of steps")
-        plain, times = _Plain(), 1
+            raise OffbenchError(f"its time limit is {short_repr(limit)}, not a number of steps")
+        checker, times = _ArgumentChecker(), 1
         for name, kwargs in ((spec.id, spec.kwargs), *((w.name, w.kwargs or {}) for w in spec.additional_wrappers)):
-            plain.check(kwargs, f"the arguments of {name}")
-            times *= math.prod(max(1, kwargs[key]) for key in REPEATING if isinstance(kwargs.get(key), int))
-        if times > LARGEST:
-            raise OffbenchError(f"it would repeat or stack {times:,} steps, and {LARGEST:,} are allowed; {REMEDY}")
+            checker.check(kwargs, f"the arguments of {name}")
+            times *= math.prod(max(1, kwargs[key]) for key in MULTIPLYING if isinstance(kwargs.get(key), int))
+        if times > LARGEST_ARGUMENT:
+            raise OffbenchError(
+                f"it would repeat or stack {times:,} steps, and {LARGEST_ARGUMENT:,} are allowed; {REMEDY}"
+            )
 
 
 def _check_class(entry_point: object, base: type) -> None:
     names = ENTRY_POINT.fullmatch(str(entry_point))
     if names is None:
-        raise OffbenchError(f"its entry point {str(entry_point)[:LONGEST]!r} does not have the form module:Class")
+        raise OffbenchError(f"its entry point {str(entry_point)[:LONGEST_TEXT]!r} does not have the form module:Class")
     if not (is_trusting() or _is_allowed(names[1], names[2], base)):
         kind = "environments" if base is gym.Env else "wrappers"
         raise OffbenchError(
@@ -121,10 +123,10 @@ def _check_installed(module: str) -> None:
     package = module.partition(".")[0]
     if package in sys.modules or package not in DISTRIBUTIONS:
         return
-    found = importlib.util.find_spec(package)
-    if found is None:
-        return  # importing it says so
-    folders = [os.path.realpath(path) for path in found.submodule_search_locations or ()]
+    package_spec = importlib.util.find_spec(package)
+    if package_spec is None:
+        return  # the import reports it
+    folders = [os.path.realpath(path) for path in package_spec.submodule_search_locations or ()]
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         installed = importlib.metadata.distribution(DISTRIBUTIONS[package]).locate_file(package)
         if os.path.realpath(str(installed)) in folders:
@@ -139,15 +141,15 @@ def _is_allowed(module: str, name: str, base: type) -> bool:
     return f"{module}.".startswith(PACKAGES) or f"{module}:{name}" in registered
 
 
-class _Plain:
-    """Checks that arguments are plain values: numbers, short texts that are no paths, lists and tables of them."""
+class _ArgumentChecker:
+    """Checks that arguments are numbers, short texts that are not paths, or lists and tables of these."""
 
     def __init__(self) -> None:
         self.count = 0
 
     def check(self, value: object, where: str, depth: int = 0) -> None:
         self.count += 1
-        if self.count > MOST or depth > DEEPEST:
+        if self.count > MOST_VALUES or depth > DEEPEST_NESTING:
             raise OffbenchError(f"{where} are too many or too deeply nested; {REMEDY}")
         if isinstance(value, dict):
             for key, item in value.items():
@@ -157,12 +159,12 @@ class _Plain:
             for item in value:
                 self.check(item, where, depth + 1)
         elif isinstance(value, str):
-            if len(value) > LONGEST or re.search(r"[/\\\0]", value) or value.startswith((".", "~")):
-                raise OffbenchError(f"{where} hold {value[:LONGEST]!r}, which may lead to a file; {REMEDY}")
+            if len(value) > LONGEST_TEXT or re.search(r"[/\\\0]", value) or value.startswith((".", "~")):
+                raise OffbenchError(f"{where} hold {value[:LONGEST_TEXT]!r}, which may lead to a file; {REMEDY}")
         elif isinstance(value, int):
-            if abs(value) > LARGEST:
+            if abs(value) > LARGEST_ARGUMENT:
                 raise OffbenchError(
-                    f"{where} hold {str(value)[:20]}, and whole numbers may be {LARGEST:,} at most; {REMEDY}"
+                    f"{where} hold {str(value)[:20]}, and whole numbers may be {LARGEST_ARGUMENT:,} at most; {REMEDY}"
                 )
         elif not isinstance(value, float | None):
             raise OffbenchError(f"{where} hold a {type(value).__name__}; {REMEDY}")

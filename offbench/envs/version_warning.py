@@ -1,4 +1,4 @@
-"""Whether an environment moves on the installed MuJoCo as on the recorded one."""
+"""A warning if the installed MuJoCo simulates an environment differently from the recorded one."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from offbench.common.terminal import warn
 
 
 def warn_other_physics(what: str, recorded: dict[str, str], spec: str) -> None:
-    """Print a warning when `what` was made on a MuJoCo that moves the environment of an EnvSpec (JSON) differently."""
+    """Print a warning when `what` was made on a MuJoCo that simulates an environment (EnvSpec JSON) differently."""
     made, here = recorded.get("mujoco", ""), versions()["mujoco"]
     if made and not _same_physics(made, here, spec):
         warn(f"{what} was made with mujoco {made}, installed is {here}: the physics differ, scores may not compare")
 
 
 def _same_physics(a: str, b: str, spec: str) -> bool:
-    """Return whether an environment moves alike on two MuJoCo versions; see offbench.envs.contact_margins."""
+    """Return whether two MuJoCo versions simulate an environment alike; see offbench.envs.contact_margins."""
     from offbench.envs.contact_margins import RK4_ROTATIONS_SINCE, model_of, release, rotations_changed
     from offbench.envs.environments import make_env
 

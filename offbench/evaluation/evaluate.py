@@ -1,4 +1,4 @@
-"""`evaluate`: play a run or a policy file in its environment."""
+"""`evaluate`: the returns of a run's policy or a policy file in its environment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from offbench.common.scores import interval, normalize
 from offbench.common.seeds import Purpose, check_seed
 from offbench.common.text import counted
 from offbench.envs.environments import checked_spec, env_spec, same_environment
-from offbench.envs.margin_rule import ADDED, SINCE, without_margin
+from offbench.envs.margin_rule import ADDED, MUJOCO_VERSIONS, without_margin
 from offbench.envs.recipes import d4rl_reference, load_recipe
 from offbench.envs.trust import REMEDY, is_trusting
 from offbench.evaluation.policies import load_policy
@@ -84,8 +84,10 @@ def evaluate(
         raise OffbenchError(f"{path} is a deterministic policy; leave out --stochastic")
     workers = default_workers(workers)
     with Rollouts(spec, workers if workers > 1 else 0) as rollouts:
-        outcomes = gathered(rollouts.outcomes(policy, seed, (int(Purpose.REFERENCE), 2), episodes, not stochastic))
-    returns = [episode.ret for episode in outcomes]
+        episode_stats = gathered(
+            rollouts.start_evaluation(policy, seed, (int(Purpose.REFERENCE), 2), episodes, not stochastic)
+        )
+    returns = [episode.ret for episode in episode_stats]
     env_id = json.loads(spec)["id"]
     # a run's own references are of its own environment
     if config is not None and same_environment(config.env_spec, spec):
@@ -93,8 +95,10 @@ def evaluate(
     else:
         references = {"dataset": shipped_references(spec), "d4rl": d4rl_reference(spec)}
     scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in references.items() if pair}
-    physics = f" with contact margins as in MuJoCo {SINCE[ADDED]}" if without_margin(spec)[1] == ADDED else ""
-    return Evaluation(str(path), env_id, returns, [episode.length for episode in outcomes], scores, physics)
+    physics = (
+        f" with contact margins as in MuJoCo {MUJOCO_VERSIONS[ADDED]}" if without_margin(spec)[1] == ADDED else ""
+    )
+    return Evaluation(str(path), env_id, returns, [episode.length for episode in episode_stats], scores, physics)
 
 
 def _registered(env_id: str, path: Path) -> str:

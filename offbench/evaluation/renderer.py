@@ -40,10 +40,10 @@ def working_backend() -> str | None:
 
 
 def _renders(backend: str) -> bool:
-    environment = {key: value for key, value in os.environ.items() if key != "PYOPENGL_PLATFORM"} | {KEY: backend}
+    variables = {key: value for key, value in os.environ.items() if key != "PYOPENGL_PLATFORM"} | {KEY: backend}
     try:
         done = subprocess.run(
-            [sys.executable, "-c", PROBE], env=environment, capture_output=True, timeout=TIMEOUT, check=False
+            [sys.executable, "-c", PROBE], env=variables, capture_output=True, timeout=TIMEOUT, check=False
         )
     except subprocess.TimeoutExpired:
         return False
@@ -51,7 +51,7 @@ def _renders(backend: str) -> bool:
 
 
 @contextlib.contextmanager
-def drawing_with(backend: str | None) -> Iterator[None]:
+def rendering_with(backend: str | None) -> Iterator[None]:
     """Let MuJoCo render with `backend`, by its environment variable; None changes nothing.
 
     PyOpenGL's own variable is left out: MuJoCo refuses to load if it names another renderer.

@@ -1,6 +1,6 @@
 """`video`: episodes of a policy as a video (.mp4 or .gif), rendered off-screen.
 
-    policy -> steps -> every k-th frame (k steps take 1/fps seconds) -> step and return on it -> file
+    policy -> steps -> every k-th frame (k steps take 1/fps seconds) -> step and return drawn on it -> file
 
 A video runs in real time: k follows from the environment's own frame rate (125 steps per second in Hopper).
 """
@@ -27,7 +27,7 @@ from offbench.data.levels import parse_level
 from offbench.envs.environments import Env, make_env, spaces_of, time_limit
 from offbench.envs.recipes import load_recipe
 from offbench.evaluation.evaluate import open_policy
-from offbench.evaluation.renderer import NO_RENDERER, drawing_with, working_backend
+from offbench.evaluation.renderer import NO_RENDERER, rendering_with, working_backend
 from offbench.rollouts.policy import Policy, uniform
 from offbench.rollouts.rollouts import reset, step
 
@@ -77,15 +77,19 @@ def video(
     encode = _gif if target.suffix.lower() == ".gif" else _encoder()
     backend = working_backend()
     with contextlib.ExitStack() as drawing:
-        drawing.enter_context(drawing_with(backend))  # before MuJoCo is loaded, which chooses its renderer then
+        drawing.enter_context(rendering_with(backend))  # before MuJoCo is loaded, which chooses its renderer then
         policy, spec, sampled = _policy_of(str(path), env)
         world = drawing.enter_context(_renderable(spec, backend))
         if seconds is None and time_limit(world.spec) is None:
             raise OffbenchError(f"{json.loads(spec)['id']} has no time limit (max_episode_steps); give --seconds")
         rate = float(world.metadata.get("render_fps") or fps)
-        every = max(1, round(rate / fps))
-        most = seconds * rate if seconds else float("inf")
-        encode(target, _frames(world, policy, sampled, seed, episodes, every, most, size), rate / every)
+        frame_interval = max(1, round(rate / fps))
+        max_steps = seconds * rate if seconds else float("inf")
+        encode(
+            target,
+            _frames(world, policy, sampled, seed, episodes, frame_interval, max_steps, size),
+            rate / frame_interval,
+        )
     return target
 
 
@@ -117,7 +121,7 @@ def _renderable(spec: str, backend: str | None) -> Env:
     """Make the environment for rendering. Raises OffbenchError if it cannot be rendered here."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a mode that it does not list: the first frame shows if it works
+            warnings.simplefilter("ignore")  # about an unlisted mode: the first frame shows whether it works
             env = make_env(spec, "rgb_array")
     except Exception as error:  # a third party's environment may raise anything here
         raise OffbenchError(f"{json.loads(spec)['id']} cannot be rendered (render_mode rgb_array): {error}") from error
@@ -135,29 +139,29 @@ def _renderable(spec: str, backend: str | None) -> Env:
 
 
 def _frames(
-    env: Env, policy: Policy, sampled: bool, seed: int, episodes: int, every: int, most: float, size: int
+    env: Env, policy: Policy, sampled: bool, seed: int, episodes: int, frame_interval: int, max_steps: float, size: int
 ) -> Iterator[Image]:
-    """Play episodes, `most` steps in all; yield a frame of every `every` steps, and the first and last of each."""
+    """Play up to `max_steps` steps; yield every `frame_interval`-th frame, and the first and last of each episode."""
     noisy = policy.needs_noise(not sampled)
     for index in range(episodes):
-        if most <= 0:
+        if max_steps <= 0:
             return
         rng = seeds.generator(seed, Purpose.ACTION, *STREAM, index)
         observation = reset(env, seeds.integer(seed, Purpose.RESET, *STREAM, index))
-        count, total, over = 0, 0.0, False
+        count, total, done = 0, 0.0, False
         yield _frame(env, count, total, size)
-        while not over:
+        while not done:
             noise = policy.draw(rng, 1) if noisy else None
             observation, reward, terminated, truncated = step(env, policy.act(observation[None], noise)[0])
             count, total = count + 1, total + reward
-            over = terminated or truncated or count >= most
-            if over or count % every == 0:
+            done = terminated or truncated or count >= max_steps
+            if done or count % frame_interval == 0:
                 yield _frame(env, count, total, size)
-        most -= count
+        max_steps -= count
 
 
 def _frame(env: Env, step: int, total: float, size: int) -> Image:
-    """Render the environment's current state, with step and return on it."""
+    """Render the environment's current state, with step and return drawn on it."""
     from PIL import Image, ImageDraw, ImageFont
 
     name = env.spec.id if env.spec else "the environment"
@@ -200,18 +204,20 @@ def _encoder() -> Callable[[Path, Iterator[Image], float], None]:
         ) from None
 
     def mp4(path: Path, frames: Iterator[Image], fps: float) -> None:
-        aside = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
+        temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
         with disk_errors(str(path)):
             try:
                 first = next(frames)
-                writer = imageio_ffmpeg.write_frames(str(aside), first.size, fps=fps, macro_block_size=2, quality=7)
+                writer = imageio_ffmpeg.write_frames(
+                    str(temporary), first.size, fps=fps, macro_block_size=2, quality=7
+                )
                 writer.send(None)
                 writer.send(first.tobytes())
                 for frame in frames:
                     writer.send(frame.tobytes())
                 writer.close()
-                aside.replace(path)
+                temporary.replace(path)
             finally:
-                aside.unlink(missing_ok=True)
+                temporary.unlink(missing_ok=True)
 
     return mp4

@@ -15,7 +15,7 @@ from offbench.common.terminal import warn
 from offbench.data import minari_store, transitions
 from offbench.reports.markup import Markup, join, tag
 from offbench.reports.page import table
-from offbench.reports.tables import NONE
+from offbench.reports.tables import EMPTY
 
 SHOWN = 12  # digits of a content hash, in the cards as here
 
@@ -44,14 +44,14 @@ def _sizes(task: Task) -> list[Cell]:
     try:
         recorded = minari_store.provenance(minari_store.read_metadata(task.dataset)).content_sha256
         if recorded not in (None, task.content):
-            return [NONE] * 3  # recorded again since: not worth a conversion
+            return [EMPTY] * 3  # recorded again since: not worth a conversion
         data = transitions.load(task.dataset)
     except (OffbenchError, OSError) as error:  # OSError: a name that no file system takes
         if task.dataset in minari_store.local_ids():
             warn(f"the report has no sizes of {task.dataset}: {error}")
-        return [NONE] * 3
+        return [EMPTY] * 3
     if data.content != task.content:
-        return [NONE] * 3
+        return [EMPTY] * 3
     mean = float(data.returns.mean())
     counts = [Cell(f"{count:,}", count) for count in (len(data), len(data.ends))]
     return [*counts, Cell(f"{mean:,.1f}", mean)]

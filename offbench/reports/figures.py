@@ -1,7 +1,7 @@
 """Figures of results: learning curves, final scores, IQM, performance profiles, beta and |Q| over training.
 
-A figure is drawn once and kept three ways: PNG and SVG files with a legend, and an SVG for the page without one
-(the page has its own), whose ink is the page's text color so that it reads on light and dark.
+A figure is drawn once and saved in three forms: PNG and SVG files with a legend, and an SVG for the page without one
+(the page has its own), in the page's text color, which is readable in light and dark mode.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from offbench.analysis.results import REFERENCES, Entry, Results, Task, read_res
 from offbench.analysis.statistics import Estimate, curve, iqm, profile
 from offbench.common.arrays import Array
 from offbench.common.plotting import figure, picture_file, save
-from offbench.common.scores import LARGEST, LAST
+from offbench.common.scores import LARGEST_VALUE, SCORED_EVALUATIONS
 from offbench.common.text import compact, printable
 from offbench.reports.tables import Aggregates
 
@@ -31,22 +31,22 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from matplotlib.typing import LineStyleType
 
-INK = "#21252b"  # text and axes; the page replaces it by its own text color
+TEXT_COLOR = "#21252b"  # text and axes; the page replaces it by its own text color
 GRID = "#8b93a0"
-# read on white and on near-black, and by the color-blind (after Okabe and Ito)
+# readable on white, on near-black and with color blindness (after Okabe and Ito)
 COLORS = ("#2f7fc1", "#d0700f", "#1c9a72", "#c2588f", "#8a6fd1", "#b58a00", "#d1495b", "#6b7785")
-STYLES: tuple[LineStyleType, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)))
+DASHES: tuple[LineStyleType, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)))
 SIZE = (4.4, 2.9)
 PROFILE_POINTS = 121
 
 
 @dataclass(frozen=True)
-class Line:
-    """How one method is drawn everywhere."""
+class LineStyle:
+    """The line of one method in all figures."""
 
     label: str
     color: str
-    style: LineStyleType
+    dashes: LineStyleType
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Figure:
         name: the stem of its files.
         caption: what it shows.
         alt: the same for those who cannot see it, with its main numbers.
-        lines: what a legend must tell.
+        legend: the styles that its legend lists.
     """
 
     name: str
@@ -66,18 +66,18 @@ class Figure:
     png: bytes
     svg: bytes
     inline: str
-    lines: tuple[Line, ...]
+    legend: tuple[LineStyle, ...]
 
 
-def lines(methods: Sequence[Method]) -> dict[Method, Line]:
+def line_styles(methods: Sequence[Method]) -> dict[Method, LineStyle]:
     """Return color and dashes of each method; sixteen methods and more repeat colors with other dashes."""
     return {
-        method: Line(method.label, COLORS[i % len(COLORS)], STYLES[(i + i // len(COLORS)) % len(STYLES)])
+        method: LineStyle(method.label, COLORS[i % len(COLORS)], DASHES[(i + i // len(COLORS)) % len(DASHES)])
         for i, method in enumerate(methods)
     }
 
 
-def curve_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str) -> Figure:
+def curve_figure(entries: Sequence[Entry], styles: Mapping[Method, LineStyle], name: str) -> Figure:
     """Draw one task's learning curves: mean over seeds with its 95% interval (the paper's Figure 4)."""
     task = entries[0].task
     curves = {entry.method.label: entry.drawn_curve() for entry in entries}
@@ -85,50 +85,50 @@ def curve_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
     alt = f"Learning curves on {task.name}. At the last common evaluation: {', '.join(ends)}."
     caption = "Mean over seeds, 95% bootstrap interval shaded."
     if any(entry.smoothed for entry in entries):
-        caption += f" Each point is the mean of the last {LAST} evaluations up to it."
-    shown = [looks[entry.method] for entry in entries]
-    return _draw(name, caption, alt, lambda axes: _paint_curves(axes, entries, looks), shown)
+        caption += f" Each point is the mean of the last {SCORED_EVALUATIONS} evaluations up to it."
+    shown = [styles[entry.method] for entry in entries]
+    return _draw(name, caption, alt, lambda axes: _paint_curves(axes, entries, styles), shown)
 
 
-def _paint_curves(axes: Axes, entries: Sequence[Entry], looks: Mapping[Method, Line]) -> None:
+def _paint_curves(axes: Axes, entries: Sequence[Entry], styles: Mapping[Method, LineStyle]) -> None:
     """Draw one task's learning curves."""
     for entry in entries:
         steps, values = entry.drawn_curve()
         if steps:
-            _band(axes, steps, curve(values), looks[entry.method])
+            _band(axes, steps, curve(values), styles[entry.method])
     axes.set(xlabel="updates", ylabel=_unit(entries[0].task), title=shortened(entries[0].task.name, 44))
 
 
 def plot_curves(runs: str | Path, path: str | Path) -> Path:
-    """Draw the learning curves of all runs below a folder as one picture, a panel for each dataset.
+    """Draw the learning curves of all runs below a folder as one figure, a panel for each dataset.
 
     Raises:
-        OffbenchError: there are no evaluated runs, or the picture cannot be written.
+        OffbenchError: there are no evaluated runs, or the figure cannot be written.
     """
     import matplotlib as mpl
 
     path = picture_file(path)
     results = read_results(runs)
-    looks = lines(results.methods)
-    with mpl.rc_context(_style(path.stem)):
+    styles = line_styles(results.methods)
+    with mpl.rc_context(_rc_params(path.stem)):
         fig, panels = figure(len(results.tasks))
         for axes, task in zip(panels, results.tasks, strict=True):
             entries = results.on(task)
-            _paint_curves(axes, entries, looks)
-            axes.legend(*_legend([looks[entry.method] for entry in entries]), frameon=False, fontsize="small")
+            _paint_curves(axes, entries, styles)
+            axes.legend(*_legend([styles[entry.method] for entry in entries]), frameon=False, fontsize="small")
         return save(fig, path)
 
 
-def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: str) -> Figure:
+def final_figure(entries: Sequence[Entry], styles: Mapping[Method, LineStyle], name: str) -> Figure:
     """Draw one task's final scores: a dot per seed, a bar for their mean."""
     task = entries[0].task
 
     def paint(axes: Axes) -> None:
         for row, entry in enumerate(entries):
-            color = looks[entry.method].color
+            color = styles[entry.method].color
             axes.plot(entry.scores, [row] * len(entry.scores), "o", color=color, alpha=0.75, markersize=5, mew=0)
             axes.plot([np.mean(entry.scores)] * 2, [row - 0.32, row + 0.32], color=color, linewidth=2)
-        _named_rows(axes, [looks[entry.method].label for entry in entries])
+        _named_rows(axes, [styles[entry.method].label for entry in entries])
         axes.set(xlabel=_unit(task), title=shortened(task.name, 44))
 
     means = ", ".join(f"{entry.method.label} {np.mean(entry.scores):.1f}" for entry in entries)
@@ -137,16 +137,16 @@ def final_figure(entries: Sequence[Entry], looks: Mapping[Method, Line], name: s
     )
 
 
-def iqm_figure(iqms: Aggregates, looks: Mapping[Method, Line]) -> Figure:
+def iqm_figure(iqms: Aggregates, styles: Mapping[Method, LineStyle]) -> Figure:
     """Draw every method's IQM with its interval."""
 
     def paint(axes: Axes) -> None:
         for row, (method, (estimate, _)) in enumerate(iqms.items()):
-            color = looks[method].color
+            color = styles[method].color
             if estimate.low is not None and estimate.high is not None:
                 axes.plot([estimate.low, estimate.high], [row, row], color=color, linewidth=7, alpha=0.35)
             axes.plot([estimate.value] * 2, [row - 0.3, row + 0.3], color=color, linewidth=2.5)
-        _named_rows(axes, [looks[method].label for method in iqms])
+        _named_rows(axes, [styles[method].label for method in iqms])
         axes.set(xlabel="IQM of normalized scores")
 
     text = ", ".join(f"{method.label} {estimate}" for method, (estimate, _) in iqms.items())
@@ -154,23 +154,23 @@ def iqm_figure(iqms: Aggregates, looks: Mapping[Method, Line]) -> Figure:
     return _draw("iqm", caption, f"Interquartile means with 95% intervals: {text}.", paint)
 
 
-def profile_figure(iqms: Aggregates, looks: Mapping[Method, Line]) -> Figure:
+def profile_figure(iqms: Aggregates, styles: Mapping[Method, LineStyle]) -> Figure:
     """Draw the performance profiles: the fraction of runs above each score."""
     every = [value for _, scores in iqms.values() for values in scores.values() for value in values]
     taus = np.linspace(min(0.0, min(every)), max(100.0, max(every)), PROFILE_POINTS)
 
     def paint(axes: Axes) -> None:
         for method, (_, scores) in iqms.items():
-            _band(axes, taus.tolist(), profile(scores, taus.tolist()), looks[method])
+            _band(axes, taus.tolist(), profile(scores, taus.tolist()), styles[method])
         axes.set(xlabel="normalized score τ", ylabel="fraction of runs above τ", ylim=(-0.02, 1.02))
 
     halves = {m.label: profile(s, [50.0])[0].value for m, (_, s) in iqms.items()}
     text = ", ".join(f"{label} {100 * half:.0f}%" for label, half in halves.items())
     caption = "Fraction of all runs that score above τ, 95% stratified bootstrap interval shaded. Higher is better."
-    return _draw("profiles", caption, f"Performance profiles. Runs above 50: {text}.", paint, list(looks.values()))
+    return _draw("profiles", caption, f"Performance profiles. Runs above 50: {text}.", paint, list(styles.values()))
 
 
-def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure | None:
+def iqm_curve_figure(results: Results, styles: Mapping[Method, LineStyle]) -> Figure | None:
     """Draw the IQM over all tasks against the updates, of the methods that have all tasks, where their runs meet.
 
     Returns:
@@ -189,16 +189,16 @@ def iqm_curve_figure(results: Results, looks: Mapping[Method, Line]) -> Figure |
     def paint(axes: Axes) -> None:
         for method, (shown, curves) in whole.items():
             points = [iqm({t: v[:, s.index(step)].tolist() for t, (s, v) in curves.items()}, 2000) for step in shown]
-            _band(axes, shown, points, looks[method])
+            _band(axes, shown, points, styles[method])
         axes.set(xlabel="updates", ylabel="IQM of normalized scores", title="all tasks")
 
     caption = "Interquartile mean over all tasks, 95% interval shaded; methods that have all tasks."
     alt = f"Learning curves of the interquartile mean over all tasks: {', '.join(m.label for m in whole)}."
-    return _draw("curves-iqm", caption, alt, paint, [looks[method] for method in whole])
+    return _draw("curves-iqm", caption, alt, paint, [styles[method] for method in whole])
 
 
 def loss_figure(
-    entries: Sequence[Entry], looks: Mapping[Method, Line], name: str, column: str, label: str
+    entries: Sequence[Entry], styles: Mapping[Method, LineStyle], name: str, column: str, label: str
 ) -> Figure | None:
     """Draw a column of losses.csv over training: mean over seeds, their range shaded; None if no run has it."""
     task = entries[0].task
@@ -210,14 +210,14 @@ def loss_figure(
         for method, (steps, values) in series.items():
             mean, low, high = values.mean(0), values.min(0), values.max(0)
             points = [Estimate(*map(float, row)) for row in zip(mean, low, high, strict=True)]
-            _band(axes, steps, points, looks[method])
+            _band(axes, steps, points, styles[method])
         if column == "beta":
             axes.set_ylim(-0.03, 1.03)
         axes.set(xlabel="updates", ylabel=label, title=shortened(task.name, 44))
 
     ends = [f"{method.label} {values.mean(0)[-1]:.3g} at {steps[-1]:,}" for method, (steps, values) in series.items()]
     alt = f"{label} over training on {task.name}. At the end: {', '.join(ends)}."
-    return _draw(name, "Mean over seeds, range shaded.", alt, paint, [looks[method] for method in series])
+    return _draw(name, "Mean over seeds, range shaded.", alt, paint, [styles[method] for method in series])
 
 
 def _column(entry: Entry, column: str) -> tuple[list[int], Array] | None:
@@ -230,16 +230,17 @@ def _column(entry: Entry, column: str) -> tuple[list[int], Array] | None:
     if not steps:
         return None
     values = np.array([[run[step] for step in steps] for run in series])
-    return steps, np.where(np.abs(values) < LARGEST, values, np.nan)  # of a run that diverges; no axis is as long
+    # a diverging run may exceed what an axis can show
+    return steps, np.where(np.abs(values) < LARGEST_VALUE, values, np.nan)
 
 
-def _band(axes: Axes, x: Sequence[float], points: Sequence[Estimate], look: Line) -> None:
+def _band(axes: Axes, x: Sequence[float], points: Sequence[Estimate], style: LineStyle) -> None:
     values = [point.value for point in points]
     marker = "o" if len(x) == 1 else ""
-    axes.plot(x, values, color=look.color, linestyle=look.style, linewidth=1.6, marker=marker, markersize=4)
+    axes.plot(x, values, color=style.color, linestyle=style.dashes, linewidth=1.6, marker=marker, markersize=4)
     if all(point.low is not None for point in points):
         low, high = np.array([(point.low, point.high) for point in points], float).T
-        axes.fill_between(x, low, high, color=look.color, alpha=0.16, linewidth=0)
+        axes.fill_between(x, low, high, color=style.color, alpha=0.16, linewidth=0)
 
 
 def _named_rows(axes: Axes, names: Sequence[str]) -> None:
@@ -257,13 +258,13 @@ def _two_lines(name: str) -> str:
 
 
 def shortened(text: str, most: int) -> str:
-    """Return text without its middle where it is too long for a picture: variants differ at their ends."""
+    """Return text without its middle where it is too long for a figure: variants differ at their ends."""
     text = printable(text)
     return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most - most // 2 - 1) :]}"
 
 
 def _tick(value: float) -> str:
-    """Return the label of a place on the horizontal axis: `300k` for whole numbers, `22.5` for others."""
+    """Return the label of a tick on the horizontal axis: `300k` for whole numbers, `22.5` for others."""
     return compact(round(value)) if abs(value) >= 10 and math.isclose(value, round(value)) else f"{value:g}"
 
 
@@ -271,11 +272,13 @@ def _unit(task: Task) -> str:
     return "return" if task.reference is None else f"normalized score ({REFERENCES[task.reference]})"
 
 
-def _draw(name: str, caption: str, alt: str, paint: Callable[[Axes], None], legend: Sequence[Line] = ()) -> Figure:
-    """Draw a figure and keep it three ways."""
+def _draw(
+    name: str, caption: str, alt: str, paint: Callable[[Axes], None], legend: Sequence[LineStyle] = ()
+) -> Figure:
+    """Draw a figure and save it in its three forms."""
     import matplotlib as mpl
 
-    with mpl.rc_context(_style(name)):
+    with mpl.rc_context(_rc_params(name)):
         fig, (axes,) = figure()
         fig.set_size_inches(*SIZE)
         fig.patch.set_alpha(0)
@@ -287,7 +290,7 @@ def _draw(name: str, caption: str, alt: str, paint: Callable[[Axes], None], lege
         inline = _saved(fig, "svg").decode()
         fig.patch.set_alpha(1)
         if legend:
-            columns = 2 if max(len(look.label) for look in legend) <= 24 else 1
+            columns = 2 if max(len(style.label) for style in legend) <= 24 else 1
             fig.set_size_inches(SIZE[0], SIZE[1] + 0.2 * math.ceil(len(legend) / columns))
             fig.legend(
                 *_legend(legend, 48), loc="outside lower center", ncols=columns, frameon=False, fontsize="small"
@@ -296,24 +299,30 @@ def _draw(name: str, caption: str, alt: str, paint: Callable[[Axes], None], lege
     return Figure(name, caption, alt, png, svg, _for_page(inline, name), tuple(legend))
 
 
-def _style(name: str) -> Any:
+def _rc_params(name: str) -> Any:
     """Return matplotlib's settings: a $ in a name is no formula, and the ids in an SVG are always the same."""
-    style = {"text.parse_math": False, "svg.fonttype": "none", "svg.hashsalt": name, "axes.labelcolor": INK}
-    style |= {"text.color": INK, "axes.edgecolor": GRID, "xtick.color": INK, "ytick.color": INK, "font.size": 9}
+    style = {"text.parse_math": False, "svg.fonttype": "none", "svg.hashsalt": name, "axes.labelcolor": TEXT_COLOR}
+    style |= {
+        "text.color": TEXT_COLOR,
+        "axes.edgecolor": GRID,
+        "xtick.color": TEXT_COLOR,
+        "ytick.color": TEXT_COLOR,
+        "font.size": 9,
+    }
     grid = {"axes.grid": True, "grid.color": GRID, "grid.alpha": 0.25, "grid.linewidth": 0.6}
     return style | grid | {"axes.titlesize": 10}
 
 
-def _legend(looks: Sequence[Line], most: int = 32) -> tuple[list[Line2D], list[str]]:
+def _legend(styles: Sequence[LineStyle], most: int = 32) -> tuple[list[Line2D], list[str]]:
     """Return the lines and names of a legend: names shortened to `most` characters, numbered where they are alike."""
     from matplotlib.lines import Line2D
 
-    cut = [shortened(look.label, most) for look in looks]
+    cut = [shortened(style.label, most) for style in styles]
     names = [  # matplotlib hides labels that begin with _
-        f" {text}" if cut.count(text) == 1 else f" {number}. {shortened(look.label, most - 4)}"
-        for number, (look, text) in enumerate(zip(looks, cut, strict=True), 1)
+        f" {text}" if cut.count(text) == 1 else f" {number}. {shortened(style.label, most - 4)}"
+        for number, (style, text) in enumerate(zip(styles, cut, strict=True), 1)
     ]
-    return [Line2D([], [], color=look.color, linestyle=look.style) for look in looks], names
+    return [Line2D([], [], color=style.color, linestyle=style.dashes) for style in styles], names
 
 
 def _saved(fig: Canvas, kind: str) -> bytes:
@@ -331,4 +340,4 @@ def _for_page(svg: str, name: str) -> str:
     svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", svg)
     svg = re.sub(r' (width|height)="[^"]*pt"', "", svg, count=2)
     svg = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px system-ui, sans-serif", svg)
-    return svg.replace(INK, "currentColor").replace("<svg ", '<svg role="img" aria-hidden="true" ', 1)
+    return svg.replace(TEXT_COLOR, "currentColor").replace("<svg ", '<svg role="img" aria-hidden="true" ', 1)

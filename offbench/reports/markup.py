@@ -9,7 +9,7 @@ from offbench.common.text import printable
 
 
 class Markup(str):
-    """Text that is HTML and stays as it is."""
+    """HTML, which is not escaped again."""
 
     __slots__ = ()
 
@@ -48,5 +48,5 @@ def breakable(text: str) -> Markup:
 
 
 def prose(text: str) -> Markup:
-    """Return text with what stands between backticks as code."""
+    """Return text with the parts between backticks as code elements."""
     return join(*[tag("code", part) if i % 2 else part for i, part in enumerate(text.split("`"))])

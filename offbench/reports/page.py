@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from offbench.analysis.results import REFERENCES, Entry, Results
 from offbench.common.scores import run_return
 from offbench.common.tables import Cell, Table
-from offbench.reports.figures import Figure, Line
+from offbench.reports.figures import Figure, LineStyle
 from offbench.reports.markup import Markup, breakable, join, prose, tag
 from offbench.reports.tables import cell_id
 from offbench.training.run import Run, Session
@@ -19,15 +19,15 @@ from offbench.training.run import Run, Session
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page: its heading, content, and words between them that are not printed."""
+    """A part of the page: heading, an introduction (on the screen, not in print) and content."""
 
     name: str
     title: str
     content: Sequence[Markup]
-    words: str = ""
+    intro: str = ""
 
 
-def page(title: str, lead: Markup, sections: Sequence[Section], boxes: Sequence[Markup]) -> bytes:
+def page(title: str, lead: Markup, sections: Sequence[Section], dialogs: Sequence[Markup]) -> bytes:
     """Return the whole page. Nothing but its own script may run, and nothing may be fetched."""
     style, script = (_asset(name) for name in ("report.css", "report.js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -46,7 +46,7 @@ def page(title: str, lead: Markup, sections: Sequence[Section], boxes: Sequence[
     body = [
         tag("header", tag("h1", title), lead, tag("nav", *links, aria_label="Contents")),
         tag("main", *map(_section, sections)),
-        *boxes,
+        *dialogs,
         tag("script", Markup(script)),
     ]
     return ("<!DOCTYPE html>\n" + tag("html", head, "\n", tag("body", *body), lang="en") + "\n").encode(
@@ -59,8 +59,8 @@ def _asset(name: str) -> str:
 
 
 def _section(section: Section) -> Markup:
-    words = [tag("p", section.words, class_="screen")] if section.words else []
-    return tag("section", tag("h2", section.title), *words, *section.content, "\n", id=section.name)
+    intro = [tag("p", section.intro, class_="screen")] if section.intro else []
+    return tag("section", tag("h2", section.title), *intro, *section.content, "\n", id=section.name)
 
 
 def table(data: Table, *, caption: bool = False, download: bool = True) -> Markup:
@@ -115,7 +115,7 @@ def _cell(data: Table, column: int, cell: Cell) -> Markup:
 
 def figures(group: Sequence[Figure]) -> Markup:
     """Return figures in a grid below one legend of all their lines."""
-    looks = dict.fromkeys(look for figure in group for look in figure.lines)
+    styles = dict.fromkeys(style for figure in group for style in figure.legend)
     parts = []
     for figure in group:
         files = [
@@ -124,28 +124,28 @@ def figures(group: Sequence[Figure]) -> Markup:
         ]
         picture = tag("div", Markup(figure.inline), role="img", aria_label=figure.alt)
         parts.append(tag("figure", picture, tag("figcaption", figure.caption, " ", *files)))
-    legend = [tag("ul", *[_key(look) for look in looks], class_="legend")] if looks else []
+    legend = [tag("ul", *[_legend_item(style) for style in styles], class_="legend")] if styles else []
     return join(*legend, tag("div", *parts, class_="figures"))
 
 
-def _key(look: Line) -> Markup:
-    dashes = "" if look.style == "-" else " ".join(f"{2 * part:g}" for part in look.style[1])
-    stroke = tag("line", x1=1, y1=5, x2=31, y2=5, stroke=look.color, stroke_width=3, stroke_dasharray=dashes or None)
-    return tag("li", tag("svg", stroke, viewBox="0 0 32 10", aria_hidden="true"), breakable(look.label))
+def _legend_item(style: LineStyle) -> Markup:
+    dashes = "" if style.dashes == "-" else " ".join(f"{2 * part:g}" for part in style.dashes[1])
+    stroke = tag("line", x1=1, y1=5, x2=31, y2=5, stroke=style.color, stroke_width=3, stroke_dasharray=dashes or None)
+    return tag("li", tag("svg", stroke, viewBox="0 0 32 10", aria_hidden="true"), breakable(style.label))
 
 
-def boxes(results: Results) -> list[Markup]:
-    """Return a box for every cell of the score table: where its number comes from."""
+def dialogs(results: Results) -> list[Markup]:
+    """Return a dialog for every cell of the score table with the provenance of its number."""
     markup = []
     for i, task in enumerate(results.tasks):
         for j, method in enumerate(results.methods):
             entry = results.entries.get((task, method))
             if entry is not None:
-                markup.append(_box(results, entry, cell_id(i, j)))
+                markup.append(_dialog(results, entry, cell_id(i, j)))
     return markup
 
 
-def _box(results: Results, entry: Entry, name: str) -> Markup:
+def _dialog(results: Results, entry: Entry, name: str) -> Markup:
     task, first = entry.task, entry.runs[0].config
     references = [f"{REFERENCES[key]}: {pair[0]:g} to {pair[1]:g}" for key, pair in first.references.items() if pair]
     sessions = [session for trained in entry.runs for session in trained.config.history]
@@ -153,10 +153,10 @@ def _box(results: Results, entry: Entry, name: str) -> Markup:
         "dataset": f"{task.dataset}, content {task.content}",
         "references": "; ".join(references) or "none",
         "evaluation": f"every {first.eval_every:,} updates, {first.eval_episodes} episodes",
-        "commands": _several([trained.config.command or "from Python" for trained in entry.runs]),
-        "versions": _several([_words(session.versions) for session in sessions]),
-        "hardware": _several([_hardware(session) for session in sessions]),
-        "settings": _words(first.settings) or "none",
+        "commands": _distinct_lines([trained.config.command or "from Python" for trained in entry.runs]),
+        "versions": _distinct_lines([_key_values(session.versions) for session in sessions]),
+        "hardware": _distinct_lines([_hardware(session) for session in sessions]),
+        "settings": _key_values(first.settings) or "none",
     }
     title = f"{entry.method.label} on {task.name}"
     terms = [part for key, text in facts.items() for part in (tag("dt", key), tag("dd", breakable(text)))]
@@ -200,13 +200,13 @@ def relative(results: Results, run: Run) -> str:
     return (inside if len(results.roots) == 1 else root.name / inside).as_posix()
 
 
-def _words(values: Mapping[str, object]) -> str:
+def _key_values(values: Mapping[str, object]) -> str:
     return ", ".join(f"{key} {value}" for key, value in values.items())
 
 
 def _hardware(session: Session) -> str:
-    return f"{session.device or 'unknown device'}, {session.precision}; {_words(session.hardware)}"
+    return f"{session.device or 'unknown device'}, {session.precision}; {_key_values(session.hardware)}"
 
 
-def _several(texts: Sequence[str]) -> str:
+def _distinct_lines(texts: Sequence[str]) -> str:
     return "\n".join(dict.fromkeys(texts))

@@ -25,7 +25,7 @@ from offbench.reports import tables
 from offbench.reports.datasets import cards, dataset_table
 from offbench.reports.figures import Figure
 from offbench.reports.markup import Markup, join, tag
-from offbench.reports.page import Section, boxes, figures, page, relative, table
+from offbench.reports.page import Section, dialogs, figures, page, relative, table
 from offbench.reports.similarity import similarity_tables
 from offbench.reports.sweep import best_table
 from offbench.reports.tables import is_papers_grid, scale
@@ -63,29 +63,29 @@ def report(
     if folder.suffix.lower() in (".html", ".htm", ".pdf"):
         raise OffbenchError(f"a report is a folder with an {PAGE} in it: give --out {folder.with_suffix('')}")
     results = read_results(runs, datasets=datasets or (), methods=methods or ())
-    before = _older(folder)
+    before = _earlier_files(folder)
     aggregates = tables.iqms(results)
     by_name, pictures = _tables(results, aggregates), _figures(results, aggregates)
     written = {f"tables/{one.name}.{end}": data for one in by_name.values() for end, data in files(one).items()}
     for figure in (figure for group in pictures.values() for figure in group):
         written |= {f"figures/{figure.name}.png": figure.png, f"figures/{figure.name}.svg": figure.svg}
-    content = page(title or TITLE, _lead(results), list(_sections(results, by_name, pictures)), boxes(results))
-    written[PAGE] = content  # last: a page's links all lead somewhere
+    content = page(title or TITLE, _lead(results), list(_sections(results, by_name, pictures)), dialogs(results))
+    written[PAGE] = content  # written last, so that all its links exist
     write_together({folder / name: data for name, data in written.items()})
     for path in before - {folder / name for name in written}:
         path.unlink(missing_ok=True)
     return folder / PAGE
 
 
-def _older(folder: Path) -> set[Path]:
-    """Return the tables and figures of an older report. Raises OffbenchError if the folder is something else's."""
+def _earlier_files(folder: Path) -> set[Path]:
+    """Return the tables and figures of an older report. Raises OffbenchError if it holds another program's page."""
     if folder.exists() and not folder.is_dir():
         raise OffbenchError(f"{folder} is a file; give another --out")
     page = folder / PAGE
     try:
         with damage(str(page), "is not a report of offbench", "give another --out"):
             if GENERATOR.encode() not in read_bytes(page):
-                raise ValueError("it does not say so")
+                raise ValueError("it lacks the generator tag of offbench")
     except FileNotFoundError:
         return set()
     return {
@@ -107,19 +107,19 @@ def _tables(results: Results, aggregates: tables.Aggregates) -> dict[str, Table]
 
 def _figures(results: Results, aggregates: tables.Aggregates) -> dict[str, list[Figure]]:
     """Return all figures by what they show."""
-    looks = draw.lines(results.methods)
+    styles = draw.line_styles(results.methods)
     rows = [results.on(task) for task in results.tasks]
     stems = _stems([entries[0].task.name for entries in rows])
     groups: dict[str, list[Figure]] = {"curves": [], "finals": [], "beta": [], "q": [], "iqm": []}
     for entries, stem in zip(rows, stems, strict=True):
-        groups["curves"].append(draw.curve_figure(entries, looks, f"curves-{stem}"))
-        groups["finals"].append(draw.final_figure(entries, looks, f"finals-{stem}"))
+        groups["curves"].append(draw.curve_figure(entries, styles, f"curves-{stem}"))
+        groups["finals"].append(draw.final_figure(entries, styles, f"finals-{stem}"))
         for group, column, label in (("beta", "beta", "β"), ("q", "q_abs", "mean |Q1(s, a)|")):
-            if figure := draw.loss_figure(entries, looks, f"{group}-{stem}", column, label):
+            if figure := draw.loss_figure(entries, styles, f"{group}-{stem}", column, label):
                 groups[group].append(figure)
     if aggregates:
-        groups["iqm"] = [draw.iqm_figure(aggregates, looks), draw.profile_figure(aggregates, looks)]
-    if len(results.tasks) > 1 and aggregates and (over_all := draw.iqm_curve_figure(results, looks)):
+        groups["iqm"] = [draw.iqm_figure(aggregates, styles), draw.profile_figure(aggregates, styles)]
+    if len(results.tasks) > 1 and aggregates and (over_all := draw.iqm_curve_figure(results, styles)):
         groups["curves"].append(over_all)
     return groups
 
@@ -147,19 +147,23 @@ def _lead(results: Results) -> Markup:
         (f"{sum(trained.reached for trained in runs):,}", "updates trained"),
     ]
     tiles = [tag("li", tag("b", value), tag("span", name)) for value, name in counts]
-    told = [f"{count} of {len(runs)} runs {STATES[name][count > 1]}." for name in STATES if (count := states[name])]
-    state = " ".join(told) or "All runs are finished."
-    if results.waiting:
-        state += f" {len(results.waiting)} more {'has' if len(results.waiting) == 1 else 'have'} no evaluation yet."
-    words = f"{scale(results)} {state}"
-    return join(tag("p", words, class_="lead"), tag("ul", *tiles, class_="tiles"))
+    counted_states = [
+        f"{count} of {len(runs)} runs {STATES[name][count > 1]}." for name in STATES if (count := states[name])
+    ]
+    state = " ".join(counted_states) or "All runs are finished."
+    if results.unevaluated:
+        state += (
+            f" {len(results.unevaluated)} more {'has' if len(results.unevaluated) == 1 else 'have'} no evaluation yet."
+        )
+    text = f"{scale(results)} {state}"
+    return join(tag("p", text, class_="lead"), tag("ul", *tiles, class_="tiles"))
 
 
 def _sections(
     results: Results, by_name: Mapping[str, Table], pictures: Mapping[str, Sequence[Figure]]
 ) -> Iterator[Section]:
-    words = "Click a number to see where it comes from: seeds, commands, versions, hardware. Click a header to sort."
-    yield Section("scores", by_name["scores"].title, [table(by_name["scores"])], words)
+    text = "Click a number to see where it comes from: seeds, commands, versions, hardware. Click a header to sort."
+    yield Section("scores", by_name["scores"].title, [table(by_name["scores"])], text)
     if "best" in by_name:
         yield Section("best", by_name["best"].title, [table(by_name["best"])])
     if "iqm" in by_name:
@@ -167,8 +171,8 @@ def _sections(
         yield Section("aggregate", "Across datasets", parts)
     if "improvement" in by_name:
         yield Section("improvement", "Probability of improvement", [table(by_name["improvement"])])
-    words = "The BDB paper's Figure 4 shows the same for its datasets." if is_papers_grid(results) else ""
-    yield Section("curves", "Learning curves", [figures(pictures["curves"])], words)
+    text = "The BDB paper's Figure 4 shows the same for its datasets." if is_papers_grid(results) else ""
+    yield Section("curves", "Learning curves", [figures(pictures["curves"])], text)
     yield Section("finals", "Final scores, seed by seed", [figures(pictures["finals"])])
     if "beside" in by_name:
         yield Section("beside", "Published scores", [table(by_name["beside"])])
@@ -176,11 +180,11 @@ def _sections(
         more = tag("details", tag("summary", "Both readings"), table(by_name["similarity-details"]))
         yield Section("similarity", by_name["similarity"].title, [table(by_name["similarity"]), more])
     if pictures["beta"]:
-        words = "BDB's weight of the discriminator against cloning: 0 is TD3+BC, 1 the discriminator alone."
-        yield Section("beta", "Beta over training", [figures(pictures["beta"])], words)
+        text = "BDB's weight of the discriminator against cloning: 0 is TD3+BC, 1 the discriminator alone."
+        yield Section("beta", "Beta over training", [figures(pictures["beta"])], text)
     if pictures["q"]:
-        words = "Mean |Q1| on the dataset's own actions. A diverging critic shows here before it shows in the score."
-        yield Section("critic", "Critic over training", [figures(pictures["q"])], words)
+        text = "Mean |Q1| on the dataset's own actions. A diverging critic shows here before it shows in the score."
+        yield Section("critic", "Critic over training", [figures(pictures["q"])], text)
     yield Section("datasets", "Datasets", [table(by_name["datasets"]), *_shipped(results)])
     summary = f"Show {counted(len(by_name['seeds'].rows), 'run')}"
     every = tag("details", tag("summary", summary), table(by_name["seeds"]))
@@ -189,12 +193,12 @@ def _sections(
 
 def _shipped(results: Results) -> list[Markup]:
     shown = cards(results)
-    words = "The complete datasets of the shipped recipes. The runs were trained on the datasets listed above."
-    return [tag("h3", "Shipped cards, for reference"), tag("p", words, class_="note"), *shown] if shown else []
+    text = "The complete datasets of the shipped recipes. The runs were trained on the datasets listed above."
+    return [tag("h3", "Shipped cards, for reference"), tag("p", text, class_="note"), *shown] if shown else []
 
 
 def _waiting(results: Results) -> Markup:
-    if not results.waiting:
+    if not results.unevaluated:
         return join()
-    names = [tag("li", relative(results, run)) for run in results.waiting]
+    names = [tag("li", relative(results, run)) for run in results.unevaluated]
     return join(tag("p", "Runs without an evaluation, and so without a score:"), tag("ul", *names))

@@ -11,7 +11,7 @@ from offbench.common.scores import mean_std, plus_minus
 from offbench.common.tables import Cell, Table
 from offbench.common.terminal import warn
 from offbench.evaluation.similarity import Similarity, read_similarity
-from offbench.reports.tables import NONE, is_papers_grid, published, row_name
+from offbench.reports.tables import EMPTY, is_papers_grid, published, row_name
 
 
 def similarity_tables(results: Results) -> list[Table]:
@@ -25,23 +25,23 @@ def similarity_tables(results: Results) -> list[Table]:
         cells = []
         for method in methods:
             if (task, method) not in similar:
-                cells.append(NONE)
+                cells.append(EMPTY)
                 continue
             values = similar[task, method]
             by_q, by_action = (mean_std([getattr(v, key) for v in values]) for key in ("q_similar", "action_similar"))
             number = paper.get((env, level, _similar_name(method)))
             cells.append(Cell(plus_minus(by_q), by_q[0], f"paper {number}" if number else ""))
             details.append([*row_name(results, task), *_similar_row(method, values, by_q, by_action, number)])
-        if any(cell is not NONE for cell in cells):
+        if any(cell is not EMPTY for cell in cells):
             rows.append([*row_name(results, task), *cells])
     if not rows:
         return []
-    beside = any(cell.below for row in rows for cell in row[2:])
+    has_paper_numbers = any(cell.below for row in rows for cell in row[2:])
     notes = [
         "Percent of sampled transitions on which the policy's action counts as the dataset's, mean ± standard "
         "deviation over seeds: |Q1(s, π(s)) - Q1(s, a)| at most the tolerance times |Q1(s, a)|. The paper gives no "
         "formula; this reading of its Table 2 is ours."
-        + (" “paper”: its printed number, on D4RL's v0 datasets." if beside else "")
+        + (" “paper”: its printed number, on D4RL's v0 datasets." if has_paper_numbers else "")
     ]
     header = ["level", "environment", *[method.label for method in methods]]
     columns = ["level", "environment", "method", "by Q (%)", "by action (%)", "paper (%)", "seeds", "step", "samples"]
@@ -84,7 +84,7 @@ def _similar_row(
         Cell(method.label),
         Cell(plus_minus(by_q), by_q[0]),
         Cell(plus_minus(by_action), by_action[0]),
-        Cell(number, float(number)) if number else NONE,
+        Cell(number, float(number)) if number else EMPTY,
         Cell(str(len(values)), len(values)),
         *numbers,
         Cell("; ".join(tolerances)),

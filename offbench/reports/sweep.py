@@ -7,11 +7,11 @@ from collections import Counter
 from offbench.analysis.results import Results
 from offbench.common.scores import mean_std, plus_minus
 from offbench.common.tables import Cell, Table
-from offbench.reports.tables import NONE, row_name
+from offbench.reports.tables import EMPTY, row_name
 
 
 def best_table(results: Results) -> Table | None:
-    """Return the best variant of each algorithm with several, a row a dataset; None if each has a single one.
+    """Return the best variant of each algorithm with several, a row per dataset; None if each has a single one.
 
     Only scores of evaluations at the same steps are ranked.
     """
@@ -23,12 +23,12 @@ def best_table(results: Results) -> Table | None:
         for algorithm in algorithms:
             entries = [entry for entry in results.on(task) if entry.method.algorithm == algorithm]
             if not entries or len({entry.window for entry in entries}) > 1 or entries[0].window is None:
-                cells.append(NONE)
+                cells.append(EMPTY)
                 continue
             best = max(entries, key=lambda entry: mean_std(entry.scores)[0])
             score = mean_std(best.scores)
             cells.append(Cell(plus_minus(score), score[0], more=f"{best.method.label}, best of {len(entries)}"))
-        if any(cell is not NONE for cell in cells):
+        if any(cell is not EMPTY for cell in cells):
             rows.append([*row_name(results, task), *cells])
     if not rows:
         return None

@@ -8,19 +8,19 @@ import importlib.resources
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
-from offbench.analysis.compare import comparable, differences, favored, partners
+from offbench.analysis.compare import comparable, differences, favored, pair_runs
 from offbench.analysis.methods import Method, unnamed_settings
-from offbench.analysis.results import REFERENCES, Entry, Results, Task, mixed_code, window_words
+from offbench.analysis.results import REFERENCES, Entry, Results, Task, mixed_code, window_text
 from offbench.analysis.statistics import Estimate, Scores, improvement, iqm, paired
-from offbench.common.scores import LAST, mean_std, plus_minus
+from offbench.common.scores import SCORED_EVALUATIONS, mean_std, plus_minus
 from offbench.common.tables import Cell, Table
 from offbench.common.text import counted, from_to
 from offbench.training.run import DIGITS, RunConfig
 
 PAPER = "BDB paper, Table 1"
 PAPER_METHODS = {"td3_bc", "cql", *(f"bdb beta={beta}" for beta in ("0.25", "0.50", "0.75", "adaptive"))}
-NONE = Cell("-")
-Aggregates: TypeAlias = Mapping[Method, tuple[Estimate, Scores]]  # a method's IQM, and the scores that it is of
+EMPTY = Cell("-")
+Aggregates: TypeAlias = Mapping[Method, tuple[Estimate, Scores]]  # a method's IQM, and the scores behind it
 FEW_SEEDS = "A task with a single seed has no interval; with few seeds it covers less than 95% (docs/statistics.md)."
 DIFFERENT_DATA = (
     "The datasets are not the same: the published numbers are of D4RL's v0 and v2 files, recorded in older "
@@ -44,7 +44,7 @@ def is_papers_grid(results: Results) -> bool:
 
 
 def score_table(results: Results) -> Table:
-    """Return the scores in the layout of the paper's Table 1: a row a dataset, a column a method."""
+    """Return the scores in the layout of the paper's Table 1: a row per dataset, a column per method."""
     paper = {
         (row["env"], row["level"], row["method"]): float(row["normalized_score"])
         for row in published("scores")
@@ -59,40 +59,40 @@ def score_table(results: Results) -> Table:
         for j, method in enumerate(results.methods):
             entry = results.entries.get((task, method))
             if entry is None:
-                cells.append(NONE)
+                cells.append(EMPTY)
                 continue
             more = [] if len(seeds) == 1 else [counted(len(entry.runs), "seed")]
             more += [] if steps[method] else [column_steps([entry])]
-            more += [] if ranked else [window_words(entry.runs)]
+            more += [] if ranked else [window_text(entry.runs)]
             number = paper.get((env, level, method.published))
             below = "" if number is None else f"paper {number:g}"
             code = " §" if (task, method.algorithm) in mixed else ""
             cells.append(_score_cell(entry, below, cell_id(i, j), ", ".join(more), code))
         below_row = "" if len({t.reference for t in results.tasks}) == 1 else REFERENCES[task.reference]
         rows.append([*row_name(results, task, below_row), *(_best(cells) if ranked else cells)])
-    beside = any(cell.below for row in rows for cell in row[2:])
+    has_paper_numbers = any(cell.below for row in rows for cell in row[2:])
     return Table(
         "scores",
         "Scores (the BDB paper's Table 1)" if is_papers_grid(results) else "Scores",
         ["level", "environment", *[method.label for method in results.methods]],
         rows,
-        _score_notes(results, seeds, beside),
+        _score_notes(results, seeds, has_paper_numbers),
         heads=2,
         small=["", "", *[steps[method] or "steps differ" for method in results.methods]],
     )
 
 
 def row_name(results: Results, task: Task, more: str = "") -> list[Cell]:
-    """Return level and environment as a row's name, with what tells it apart where another dataset has the same."""
+    """Return level and environment as a row's name, with dataset or content where the name is ambiguous."""
     env, level = task.env_and_level
     namesakes = {other.dataset for other in results.tasks if other.env_and_level == task.env_and_level}
-    apart = task.name if len(namesakes) > 1 else task.content[:DIGITS] if task.twin else ""
+    apart = task.name if len(namesakes) > 1 else task.content[:DIGITS] if task.ambiguous else ""
     below = [task.dataset if apart != task.name else "", more]
     return [Cell(level or "-"), Cell(env, below=" · ".join(filter(None, below)), more=apart)]
 
 
 def cell_id(task: int, method: int) -> str:
-    """Return the id of the box with a cell's provenance."""
+    """Return the id of the dialog with a cell's provenance."""
     return f"cell-{task}-{method}"
 
 
@@ -120,15 +120,15 @@ def _best(cells: Sequence[Cell]) -> list[Cell]:
     return [dataclasses.replace(cell, best=best) for cell, best in zip(cells, same, strict=True)]
 
 
-def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
+def _score_notes(results: Results, seeds: set[int], has_paper_numbers: bool) -> list[str]:
     entries = list(results.entries.values())
     last = from_to({entry.evaluations for entry in entries})
     over = counted(min(seeds), "seed") if len(seeds) == 1 else "the seeds that each cell names"
     single = " “± ?”: a single seed has no standard deviation." if 1 in seeds else ""
     notes = [
-        f"Mean ± standard deviation over {over}.{single} A seed's score is the mean of its last {LAST} evaluations, "
-        f"never its best ({last} of them here). {scale(results)} The best mean of a row is in bold; "
-        "`offbench compare` tests whether a difference is more than chance.",
+        f"Mean ± standard deviation over {over}.{single} A seed's score is the mean of its last "
+        f"{SCORED_EVALUATIONS} evaluations, never its best ({last} of them here). {scale(results)} The best mean of a "
+        "row is in bold; `offbench compare` tests whether a difference is more than chance.",
     ]
     if not all(results.comparable(task) for task in results.tasks):
         notes.append(
@@ -137,7 +137,7 @@ def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
         )
     if left_out := unnamed_settings(results.methods):
         notes.append(f"Settings that differ from the defaults: {'; '.join(left_out)}.")
-    if beside:
+    if has_paper_numbers:
         notes.append(f"“paper”: {PAPER} (5 seeds, 1M steps). {DIFFERENT_DATA}")
     states = set().union(*(entry.states for entry in entries))
     if "diverged" in states:
@@ -148,12 +148,12 @@ def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
         notes.insert(
             1, "§ the algorithm's runs in this row were trained by different code, as their config.json says."
         )
-    if torn := _torn(entries):
+    if several := _environments_with_several_references(entries):
         notes.append(
-            f"The datasets of {', '.join(torn)} were recorded with different references: their scores are on "
+            f"The datasets of {', '.join(several)} were recorded with different references: their scores are on "
             "different scales (the table of datasets has them)."
         )
-    if any(task.twin for task in results.tasks):
+    if any(task.ambiguous for task in results.tasks):
         notes.append(
             "A dataset named twice was recorded again with different content: the first digits of the content's hash, "
             "in brackets, tell them apart."
@@ -161,8 +161,8 @@ def _score_notes(results: Results, seeds: set[int], beside: bool) -> list[str]:
     return notes
 
 
-def _torn(entries: Sequence[Entry]) -> list[str]:
-    """Return the environments whose datasets brought more than one pair of references."""
+def _environments_with_several_references(entries: Sequence[Entry]) -> list[str]:
+    """Return the environments whose datasets have more than one pair of references."""
     scales: dict[str, set[tuple[float, ...]]] = {}
     for entry in entries:
         for trained in entry.runs:
@@ -174,15 +174,15 @@ def _torn(entries: Sequence[Entry]) -> list[str]:
 def scale(results: Results) -> str:
     """Return what a score of these results means, in a sentence or two."""
     references = {task.reference for task in results.tasks}
-    words = {
+    texts = {
         "dataset": "Scores are normalized by each dataset's own reference: 0 is the random policy, 100 the expert.",
         "d4rl": "Scores are normalized by D4RL's constants, measured in older environments: 0 is their random policy, "
         "100 their expert.",
         None: "Datasets without a reference have no score: their rows are raw returns.",
     }
     if len(references) == 1:
-        return words[references.pop()]
-    return " ".join([text for key, text in words.items() if key in references]) + " Each row says which."
+        return texts[references.pop()]
+    return " ".join([text for key, text in texts.items() if key in references]) + " Each row says which."
 
 
 def beside_table(results: Results) -> Table | None:
@@ -201,9 +201,9 @@ def beside_table(results: Results) -> Table | None:
     rows = []
     for entry, published_scores in pairs:
         ours = [entry.mean_std(reference) for reference in ("dataset", "d4rl")]
-        cells = [Cell(plus_minus(pair), pair[0]) if pair else NONE for pair in ours]
+        cells = [Cell(plus_minus(pair), pair[0]) if pair else EMPTY for pair in ours]
         cells += [
-            Cell(text, float(text.split()[0])) if (text := published_scores.get(source)) else NONE
+            Cell(text, float(text.split()[0])) if (text := published_scores.get(source)) else EMPTY
             for source in sources
         ]
         rows.append([*row_name(results, entry.task), Cell(entry.method.label), *cells])
@@ -271,13 +271,13 @@ def improvement_table(results: Results, iqms: Aggregates) -> Table:
 def _better(results: Results, a: Method, b: Method) -> bool:
     """Return whether `compare` finds A better, on the tasks that have scores."""
     groups = ([entry for entry in results.of(method) if entry.task.reference] for method in (a, b))
-    both = partners(*groups)
+    both = pair_runs(*groups)
     return bool(both) and comparable(both) and favored(paired(differences(both))) > 0
 
 
 def _chance(estimate: Estimate | None, better: bool) -> Cell:
     if estimate is None:
-        return NONE
+        return EMPTY
     in_percent = estimate.percent()
     text = f"{in_percent.value:.0f}"
     if in_percent.low is not None:
@@ -296,7 +296,7 @@ def seed_table(results: Results) -> Table:
                     Cell(entry.task.name),
                     Cell(entry.method.label),
                     Cell(str(trained.seed), trained.seed),
-                    Cell(f"{score:.2f}", score) if entry.task.reference else NONE,
+                    Cell(f"{score:.2f}", score) if entry.task.reference else EMPTY,
                     Cell(f"{ret:.2f}", ret),
                     Cell(REFERENCES[entry.task.reference]),
                     Cell(str(len(trained.window)), len(trained.window)),
@@ -305,19 +305,19 @@ def seed_table(results: Results) -> Table:
                     Cell(trained.state),
                 ]
             )
-    for run in results.waiting:
+    for run in results.unevaluated:
         config = run.config()
-        words = [_waiting_name(results, config), f"{config.algorithm} {config.variant}".removesuffix(" default")]
+        texts = [_waiting_name(results, config), f"{config.algorithm} {config.variant}".removesuffix(" default")]
         numbers = [
             Cell(str(config.seed)),
-            NONE,
-            NONE,
-            NONE,
+            EMPTY,
+            EMPTY,
+            EMPTY,
             Cell("0", 0),
             Cell("0", 0),
             Cell(f"{config.steps:,}"),
         ]
-        rows.append([*map(Cell, words), *numbers, Cell("diverged" if run.diverged else "not evaluated yet")])
+        rows.append([*map(Cell, texts), *numbers, Cell("diverged" if run.diverged else "not evaluated yet")])
     header = ["dataset", "method", "seed", "score", "return", "reference", "evaluations", "step", "of", "state"]
     return Table("seeds", "Every run", header, rows, [], 3)
 
@@ -325,5 +325,5 @@ def seed_table(results: Results) -> Table:
 def _waiting_name(results: Results, config: RunConfig) -> str:
     """Return a dataset's id, with its content's first digits where the id alone is ambiguous."""
     contents = {task.content for task in results.tasks if task.dataset == config.dataset}
-    twin = bool(contents) and contents != {config.dataset_sha256}
-    return Task(config.dataset, config.dataset_sha256, None, twin).name
+    ambiguous = bool(contents) and contents != {config.dataset_sha256}
+    return Task(config.dataset, config.dataset_sha256, None, ambiguous).name

@@ -1,4 +1,4 @@
-"""A behaviour policy that is a user's own function: `module:function`, from an observation to an action."""
+"""A behaviour policy that calls a user's own function `module:function` with an observation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from offbench.common.arrays import Array
 from offbench.common.errors import SHOW_TRACEBACK, OffbenchError
 
-MARK = b"offbench-function "  # never in a policy file: only this process names functions to its workers
+FUNCTION_PREFIX = b"offbench-function "  # never begins a policy file: only this process names functions to workers
 TOLERANCE = 1e-5  # beyond the bounds, of float32 actions
 
 
@@ -38,7 +38,7 @@ class FunctionPolicy:
         return False
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Return nothing for each action."""
+        """Return an empty array [count, 0]: the function takes no noise."""
         return np.zeros((count, 0))
 
     def act(self, observations: Array, noise: Array | None) -> npt.NDArray[np.float32]:
@@ -60,9 +60,9 @@ class FunctionPolicy:
         return np.array(actions, np.float32).reshape(len(observations), len(self.low))
 
     def to_bytes(self) -> bytes:
-        """Return what a worker process makes this policy from."""
+        """Return the bytes from which a worker process makes this policy."""
         bounds = np.stack([self.low, self.high]).astype(np.float32).tobytes()
-        return MARK + self.name.encode() + b"\0" + bounds
+        return FUNCTION_PREFIX + self.name.encode() + b"\0" + bounds
 
     def source(self) -> bytes:
         """Return the source of the module, for its hash."""
@@ -95,8 +95,8 @@ def function_policy(name: str, low: Array, high: Array) -> FunctionPolicy:
     return FunctionPolicy(name, low, high, function)
 
 
-def from_mark(data: bytes) -> FunctionPolicy:
+def from_worker_bytes(data: bytes) -> FunctionPolicy:
     """Make the policy that `to_bytes` wrote, in a worker process."""
-    name, bounds = data.removeprefix(MARK).split(b"\0", 1)
+    name, bounds = data.removeprefix(FUNCTION_PREFIX).split(b"\0", 1)
     low, high = np.frombuffer(bounds, np.float32).reshape(2, -1)
     return function_policy(name.decode(), low, high)

@@ -1,4 +1,4 @@
-"""The policy file: one safetensors file that says everything needed to act, and a NumPy forward that acts.
+"""The policy file: one safetensors file with everything needed to act, and its forward pass in NumPy.
 
     W0 [obs, h]  b0 [h]  W1 [h, h]  b1 [h]  W2 [h, out]  b2 [out]        (x @ W + b, activation between)
     kind "tanh"               out = act          action = tanh(out)
@@ -7,7 +7,7 @@
     kind "best_by_q"          the squashed Gaussian's best of `samples` actions by Q(observation, action in [-1, 1])
     kind "uniform"            no weights         action = uniform in the bounds
 
-The forward runs in float64 and rounds the action to float32 at its end. Matrix products differ in their last
+The forward pass runs in float64 and rounds the action to float32 at its end. Matrix products differ in their last
 bits between processors and batch sizes; the rounding hides that, so a recorded dataset is the same for any
 number of workers and, but for rare ties, on any machine with the same physics.
 """
@@ -35,7 +35,7 @@ from offbench.common.files import JsonObject, damage, read_bytes, write_bytes
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from offbench.algorithm.interface import PolicyParts  # brings PyTorch, which processes that play do without
+    from offbench.algorithm.interface import PolicyParts  # imports PyTorch, which rollout workers do not need
 
 KINDS = ("tanh", "squashed_gaussian", "gaussian", "best_by_q", "uniform")
 Layers = tuple[tuple[Array, Array], ...]
@@ -115,7 +115,7 @@ class Policy:
 
     @functools.cached_property
     def _double(self) -> _Double:
-        """What acting needs, in float64, converted once."""
+        """The arrays in float64, converted once."""
         actor, critic = (
             tuple((w.astype(np.float64), b.astype(np.float64)) for w, b in net) for net in (self.layers, self.critic)
         )
@@ -206,7 +206,7 @@ class Policy:
 
 
 def _clip(x: Array, low: Array | float, high: Array | float) -> Array:
-    """`np.clip`, whose checks cost several times as much as a few lanes' numbers."""
+    """Clip as `np.clip` does, without its checks, which dominate the time for small arrays."""
     clipped: Array = np.minimum(np.maximum(x, low), high)
     return clipped
 
@@ -261,14 +261,14 @@ def from_bytes(data: bytes) -> Policy:
         tuple((tensors[f"{net}.{i}.weight"], tensors[f"{net}.{i}.bias"]) for i in range(n)) for net, n in sizes.items()
     )
     mean, std, low, high = (tensors[name] for name in ("observation_mean", "observation_std", "low", "high"))
-    how = {key: header.get(key, default) for key, default in (("samples", 1), ("activation", "relu"))}
-    policy = Policy(str(header.get("kind")), layers, mean, std, low, high, env_id, origin, critic, **how)
+    options = {key: header.get(key, default) for key, default in (("samples", 1), ("activation", "relu"))}
+    policy = Policy(str(header.get("kind")), layers, mean, std, low, high, env_id, origin, critic, **options)
     _check_shapes(policy)
     return policy
 
 
 def _header(data: bytes) -> JsonObject:
-    """Return the JSON that the safetensors header carries for us ({} if there is none)."""
+    """Return offbench's JSON in the safetensors header ({} if there is none)."""
     length = int.from_bytes(data[:8], "little")
     try:
         header = json.loads(json.loads(data[8 : 8 + length]).get("__metadata__", {}).get("offbench", "{}"))
@@ -292,7 +292,7 @@ def _check_shapes(p: Policy) -> None:
 
 
 def check_networks(parts: Policy | PolicyParts, observations: int, actions: int) -> None:
-    """Raise ValueError if the kind is unknown, or the layers do not lead from observations to its outputs."""
+    """Raise ValueError if the kind is unknown, or the layers do not map observations to its outputs."""
     if parts.kind not in KINDS:
         raise ValueError(f"unknown kind {parts.kind!r}; the kinds are {', '.join(KINDS)}")
     if not isinstance(parts.activation, str) or parts.activation not in ACTIVATIONS:

@@ -1,10 +1,10 @@
-"""Episodes by seed: the one mechanism that records datasets and evaluates policies.
+"""Seeded episodes, by which datasets are recorded and policies are evaluated.
 
     episodes 0 1 2 3 ... --> tasks of a few episodes --> worker processes --> episodes in order
-    in a worker: up to LANES episodes step in turn, so one policy forward serves them all
+    in a worker: up to PARALLEL_EPISODES episodes advance together, with one forward pass of the policy for all
 
 Episode i is reset with integer(seed, RESET, *stream, i) and acts with generator(seed, ACTION, *stream, i), so
-neither the number of workers nor the task it fell into can change it. Workers never import PyTorch.
+it depends neither on the number of workers nor on its task. Workers never import PyTorch.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ import numpy.typing as npt
 from offbench.common import seeds
 from offbench.common.arrays import Array
 from offbench.common.errors import SHOW_TRACEBACK, OffbenchError
-from offbench.common.processes import closing, quiet_start, start_errors, start_worker
+from offbench.common.processes import closing, start_errors, start_worker, uninterrupted_start
 from offbench.common.scores import interval
 from offbench.common.seeds import Purpose
-from offbench.envs.environments import LONGEST, Env, make_env, reason, time_limit
-from offbench.rollouts.function_policy import MARK, FunctionPolicy, from_mark
+from offbench.envs.environments import LONGEST_EPISODE, Env, make_env, reason, time_limit
+from offbench.rollouts.function_policy import FUNCTION_PREFIX, FunctionPolicy, from_worker_bytes
 from offbench.rollouts.policy import Policy, from_bytes
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
-LANES = 16  # episodes that share a policy forward, and of a task
-LAST_TASK = 4  # near the end of a recording, where large tasks would leave workers idle
+PARALLEL_EPISODES = 16  # episodes that share one policy forward pass; also the most episodes of a task
+LAST_TASK = 4  # smallest task near the end of a recording, where large ones would leave workers idle
 NOISE_BLOCK = 1024  # actions whose noise is drawn at once
 
 
@@ -50,7 +50,7 @@ class Episode:
         observations: [T + 1, obs], in the environment's own precision; the last one has no action.
         actions: [T, act] float32, in the environment's bounds.
         rewards: [T] float64.
-        terminated, truncated: how it ended, Gymnasium's meaning.
+        terminated, truncated: how it ended, as in Gymnasium.
     """
 
     seed: int
@@ -73,7 +73,14 @@ class Episode:
 
 @dataclass(frozen=True)
 class Task:
-    """A few episodes of one policy, as a worker gets them."""
+    """A few episodes of one policy: the unit of work of a worker.
+
+    Attributes:
+        spec: EnvSpec JSON.
+        policy: the bytes of a policy file, or of a FunctionPolicy.
+        seed, stream: with an episode's index, the seed of the episode.
+        indices: of the episodes.
+    """
 
     spec: str
     policy: bytes
@@ -84,8 +91,8 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What evaluations keep of an episode."""
+class EpisodeStats:
+    """The return and the length of an episode."""
 
     ret: float
     length: int
@@ -94,15 +101,15 @@ class Outcome:
 MEASURES = ("return", "low", "high", "length")
 
 
-def summary(outcomes: list[Outcome], prefix: str = "") -> dict[str, float]:
-    """Return mean return, its 95% interval and mean length."""
-    mean, low, high = interval([o.ret for o in outcomes])
-    length = float(np.mean([o.length for o in outcomes]))
+def summary(episode_stats: list[EpisodeStats], prefix: str = "") -> dict[str, float]:
+    """Return mean `return`, its 95% interval `low` to `high` and mean `length`, keys prefixed with `prefix`."""
+    mean, low, high = interval([o.ret for o in episode_stats])
+    length = float(np.mean([o.length for o in episode_stats]))
     values = {"return": mean, "low": low, "high": high, "length": length}
     return {prefix + key: round(value, 4) for key, value in values.items()}
 
 
-class _Lane:
+class _RunningEpisode:
     """One environment in the middle of an episode."""
 
     def __init__(self, env: Env, policy: Policy | FunctionPolicy, task: Task, slot: int) -> None:
@@ -110,14 +117,14 @@ class _Lane:
         self.env, self.policy, self.slot = env, policy, slot
         self.seed = seeds.integer(task.seed, Purpose.RESET, *task.stream, index)
         self.rng = seeds.generator(task.seed, Purpose.ACTION, *task.stream, index)
-        self.limit = time_limit(env.spec) or LONGEST
+        self.limit = time_limit(env.spec) or LONGEST_EPISODE
         self.observations = [reset(env, self.seed)]
         self.actions: list[Array] = []
         self.rewards: list[float] = []
         self.noise: Array = np.empty((0, 0))
 
     def next_noise(self) -> Array:
-        # fewer where each takes many numbers, which are the same in blocks of any size
+        # fewer where an action takes many samples; the numbers do not depend on the block's size
         block = max(1, NOISE_BLOCK // getattr(self.policy, "samples", 1))
         position = len(self.actions) % block
         if position == 0:
@@ -161,7 +168,7 @@ def step(env: Env, action: Array) -> tuple[Array, float, bool, bool]:
     """
     try:
         observation, reward, terminated, truncated, _ = env.step(action)
-        return _observation(env, observation), number(reward), bool(terminated), bool(truncated)
+        return _observation(env, observation), scalar_reward(reward), bool(terminated), bool(truncated)
     except Exception as error:
         raise _failed(env, error) from error
 
@@ -179,8 +186,8 @@ def _check_finite(env: Env, observations: Array, rewards: Array | float) -> None
             raise _failed(env, ValueError(f"{name} with NaN or infinite numbers"))
 
 
-class Named(gym.Wrapper[Array, Array, Array, Array]):
-    """An environment whose failures, NaN among them, are OffbenchErrors that name it."""
+class ErrorReporting(gym.Wrapper[Array, Array, Array, Array]):
+    """An environment that raises its failures, NaN values included, as OffbenchErrors with its name."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, object] | None = None
@@ -195,7 +202,7 @@ class Named(gym.Wrapper[Array, Array, Array, Array]):
         return observation, reward, *ends, {}  # type: ignore[return-value]
 
 
-def number(reward: SupportsFloat) -> float:
+def scalar_reward(reward: SupportsFloat) -> float:
     """Return a reward as a number; an array of one element counts as one. Raises ValueError for any other."""
     if isinstance(reward, np.ndarray):
         if reward.size != 1:
@@ -221,51 +228,51 @@ def play(task: Task) -> list[Episode]:
     return _play(task, lambda episode: episode)
 
 
-def play_outcomes(task: Task) -> list[Outcome]:
-    """Play a task's episodes and return what evaluations keep of them."""
-    return _play(task, lambda episode: Outcome(float(episode.rewards.sum()), len(episode)))
+def play_stats(task: Task) -> list[EpisodeStats]:
+    """Play a task's episodes and return their returns and lengths, in its order."""
+    return _play(task, lambda episode: EpisodeStats(float(episode.rewards.sum()), len(episode)))
 
 
 def _play(task: Task, keep: Callable[[Episode], T]) -> list[T]:
     policy = _policy(task.policy)
     noisy = policy.needs_noise(task.deterministic)
-    envs = kept_envs(task.spec, min(LANES, len(task.indices)))
+    envs = cached_envs(task.spec, min(PARALLEL_EPISODES, len(task.indices)))
     waiting = iter(range(len(task.indices)))
-    lanes = [_Lane(env, policy, task, slot) for env, slot in zip(envs, waiting, strict=False)]
+    running = [_RunningEpisode(env, policy, task, slot) for env, slot in zip(envs, waiting, strict=False)]
     done: dict[int, T] = {}
-    while lanes:
+    while running:
         if closing():
             raise CancelledError
-        observations = np.array([lane.observations[-1] for lane in lanes])
-        noise = np.array([lane.next_noise() for lane in lanes]) if noisy else None
+        observations = np.array([episode_run.observations[-1] for episode_run in running])
+        noise = np.array([episode_run.next_noise() for episode_run in running]) if noisy else None
         actions = policy.act(observations, noise)
-        going = []
-        for lane, action in zip(lanes, actions, strict=True):
-            episode = lane.step(action)
+        still_running = []
+        for episode_run, action in zip(running, actions, strict=True):
+            episode = episode_run.step(action)
             if episode is None:
-                going.append(lane)
+                still_running.append(episode_run)
                 continue
-            done[lane.slot] = keep(episode)
+            done[episode_run.slot] = keep(episode)
             slot = next(waiting, None)
             if slot is not None:
-                going.append(_Lane(lane.env, policy, task, slot))
-        lanes = going
+                still_running.append(_RunningEpisode(episode_run.env, policy, task, slot))
+        running = still_running
     return [done[slot] for slot in range(len(task.indices))]
 
 
 @functools.lru_cache(maxsize=4)
 def _policy(data: bytes) -> Policy | FunctionPolicy:
-    return from_mark(data) if data.startswith(MARK) else from_bytes(data)
+    return from_worker_bytes(data) if data.startswith(FUNCTION_PREFIX) else from_bytes(data)
 
 
 @functools.lru_cache(maxsize=4)
-def _pool_of_envs(spec: str) -> list[Env]:
+def _env_cache(spec: str) -> list[Env]:
     return []
 
 
-def kept_envs(spec: str, count: int) -> list[Env]:
+def cached_envs(spec: str, count: int) -> list[Env]:
     """Return `count` environments of this process, made once and kept."""
-    pool = _pool_of_envs(spec)
+    pool = _env_cache(spec)
     while len(pool) < count:
         try:
             pool.append(make_env(spec))
@@ -294,13 +301,13 @@ class Rollouts:
 
     def __exit__(self, *_: object) -> None:
         if self._pool:
-            self._closing.value = 1  # saves a second of episodes that are not needed
+            self._closing.value = 1  # workers stop their unfinished episodes
             self._pool.shutdown(wait=True, cancel_futures=True)
 
     def call(self, function: Callable[[*Ts], T], *arguments: *Ts) -> Future[T]:
         """Start a module's function in a worker process, or run it now if there is none."""
         if self._pool:
-            with quiet_start():
+            with uninterrupted_start():
                 try:
                     return self._pool.submit(function, *arguments)
                 except BrokenProcessPool:
@@ -310,13 +317,17 @@ class Rollouts:
         return future
 
     def episodes(
-        self, policy: Policy | FunctionPolicy, seed: int, stream: tuple[int, ...] = (), enough: int | None = None
+        self,
+        policy: Policy | FunctionPolicy,
+        seed: int,
+        stream: tuple[int, ...] = (),
+        transitions_needed: int | None = None,
     ) -> Generator[Episode, None, None]:
         """Yield episodes 0, 1, 2, ... of the sampling policy without end, in order. Close the iterator when done.
 
         Args:
-            enough: the number of transitions that the caller needs: near it, tasks become small, and no episode
-                starts that is unlikely to be needed.
+            transitions_needed: the number of transitions that the caller needs: near it, tasks become small, and no
+                episode starts that is unlikely to be needed.
         """
         data, ahead = policy.to_bytes(), 1 if not self._pool else 2 * self.workers + 1
         pending: collections.deque[Future[list[Episode]]] = collections.deque()
@@ -324,9 +335,10 @@ class Rollouts:
         try:
             while True:
                 while len(pending) < ahead:
-                    size = LANES
-                    if enough is not None and done:
-                        wanted = (enough - steps) * done / steps - (begun - done)  # if all are as long as those so far
+                    size = PARALLEL_EPISODES
+                    if transitions_needed is not None and done:
+                        # if all episodes are as long as those so far
+                        wanted = (transitions_needed - steps) * done / steps - (begun - done)
                         if wanted <= 0 and pending:
                             break
                         size = min(size, max(LAST_TASK, math.ceil(wanted / ahead)))
@@ -340,20 +352,20 @@ class Rollouts:
             for future in pending:
                 future.cancel()
 
-    def outcomes(
+    def start_evaluation(
         self, policy: Policy | FunctionPolicy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
-    ) -> list[Future[list[Outcome]]]:
+    ) -> list[Future[list[EpisodeStats]]]:
         """Start `count` evaluation episodes; `gathered` waits for their returns and lengths, in order."""
         data, parts = policy.to_bytes(), max(1, min(self.workers, count // 2))  # a task per worker, if they suffice
         tasks = (
             Task(self.spec, data, seed, stream, tuple(chunk.tolist()), deterministic)
             for chunk in np.array_split(np.arange(count), parts)
         )
-        return [self.call(play_outcomes, task) for task in tasks]
+        return [self.call(play_stats, task) for task in tasks]
 
 
 def result(future: Future[T]) -> T:
-    """Return a task's result; a worker that was killed becomes a clear line."""
+    """Return a task's result. Raises OffbenchError if its worker process died."""
     try:
         return future.result()
     except BrokenProcessPool:
@@ -361,7 +373,7 @@ def result(future: Future[T]) -> T:
 
 
 def gathered(futures: Iterable[Future[list[T]]]) -> list[T]:
-    """Return the results of several tasks, end to end."""
+    """Return the results of several tasks, concatenated in order."""
     return [item for future in futures for item in result(future)]
 
 

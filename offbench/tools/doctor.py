@@ -31,7 +31,7 @@ from offbench.rollouts.rollouts import Episode
 
 OK, NOTE, BROKEN = "ok", "note", "broken"
 REPLAYED = 64  # transitions of the physics check
-TOLERANCE = 1e-6  # with contact margins that MuJoCo 3.5 and later add up, it is 0.2 or more
+TOLERANCE = 1e-6  # largest accepted error; other contact margins give 0.2 or more
 ROOM = 1e9  # bytes; a level of a million transitions takes 0.2 to 0.5 GB
 EXTRAS = {  # module: what it is for
     "ray": "offbench benchmark --executor ray",
@@ -137,14 +137,14 @@ def replay_error(count: int) -> float:
     episodes = load_replay(ladder / "medium-replay.hdf5", digest, observations, actions.low, actions.high)
     env.reset(seed=0)
     errors: list[float] = []
-    for before, action, after in _spread(episodes, count):
+    for before, action, after in _sample_transitions(episodes, count):
         env.set_state(np.concatenate([[0.0], before[:5]]), before[5:])  # type: ignore[attr-defined]
         errors.append(float(np.abs(env.step(action)[0] - after).max()))
     env.close()
     return max(errors)
 
 
-def _spread(episodes: Iterator[Episode], count: int) -> Iterator[tuple[Array, Array, Array]]:
+def _sample_transitions(episodes: Iterator[Episode], count: int) -> Iterator[tuple[Array, Array, Array]]:
     """Yield (observation, action, next observation), one from the middle of every eighth episode."""
     yielded = 0
     for number, episode in enumerate(episodes):

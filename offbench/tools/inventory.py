@@ -16,12 +16,12 @@ from offbench.envs.recipes import load_recipe, names
 from offbench.training.registry import algorithm_names
 
 if TYPE_CHECKING:
-    from offbench.analysis.results import Trained
+    from offbench.analysis.results import EvaluatedRun
     from offbench.training.run import Run, RunConfig
 
 
 def inventory(what: str | None = None, *, runs: str | Path = "runs") -> JsonObject:
-    """Return what is here.
+    """Return the available environments, levels, algorithms, datasets and runs.
 
     Args:
         what: `environments` (with their shipped ladders), `levels`, `algorithms`, `datasets` (local ones) or `runs`;
@@ -86,20 +86,20 @@ def _runs(root: str | Path) -> list[JsonObject]:
 
     if Path(root).exists() and not Path(root).is_dir():
         raise OffbenchError(f"{root} is not a folder of runs")
-    entries, waiting = entries_of(find_runs(Path(root)))
+    entries, unevaluated = entries_of(find_runs(Path(root)))
     rows = [
         _run(entry.task.name, entry.method.label, trained.run, trained.config, trained)
         for entry in entries
         for trained in entry.runs
     ]
-    for run in waiting:
+    for run in unevaluated:
         config = run.config()
         method = config.label or method_of(config.algorithm, config.variant, config.settings).label
         rows.append(_run(config.dataset, method, run, config, None))
     return rows
 
 
-def _run(dataset: str, method: str, run: Run, config: RunConfig, trained: Trained | None) -> JsonObject:
+def _run(dataset: str, method: str, run: Run, config: RunConfig, trained: EvaluatedRun | None) -> JsonObject:
     """Return a run's row; `trained` is None if it was not evaluated yet."""
 
     def score(reference: str) -> float | None:

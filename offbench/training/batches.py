@@ -2,7 +2,7 @@
 
     chunk of CHUNK updates:  per run, from (run seed, chunk):  indices [CHUNK, runs, batch], noise [CHUNK, runs, ...]
 
-A run's random numbers depend only on its own seed, the chunk and the kind of device. So it is the same run alone and
+A run's random numbers depend only on its own seed, the chunk and the type of device. So a run is the same alone and
 in a stack, and a resume needs no generator state.
 """
 
@@ -23,7 +23,7 @@ from offbench.common.seeds import Purpose
 from offbench.data.transitions import Transitions
 from offbench.training.spec import RunSpec
 
-CHUNK = 100  # updates whose random numbers are drawn together; part of what a seed means, never change
+CHUNK = 100  # updates whose random numbers are drawn together; part of the definition of a seed: never change it
 
 
 class Store:

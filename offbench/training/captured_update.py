@@ -15,13 +15,14 @@ from offbench.common.terminal import inform
 from offbench.training.batches import Store
 
 Sums = list[tuple[str, float, int]]  # of each logged quantity: its name, its sum, and over how many updates
-RECORDED = 6  # updates of a phase before a replay is trusted on a CPU: all but the first are recorded and compared
+# updates of a phase before a replay is trusted on a CPU: all but the first are recorded and compared
+RECORDED_UPDATES = 6
 RECORD_EVERY = 1000  # updates of a phase between two later records of it
 WARM_UP = 3  # updates of a phase before it is captured on a GPU: libraries allocate workspaces in the first ones
 
 
 class Program:
-    """One update of every run, over and over.
+    """Repeats one update of every run.
 
     A counter on the device picks each update's rows of the chunk, and logs are added up on the device, so nothing
     waits for the host.
@@ -39,7 +40,7 @@ class Program:
         self._recordings: dict[Hashable, Recording] = {}
         self._done: dict[Hashable, int] = {}  # updates of each phase
         self.eager = not algorithm.capture  # whether every update runs without capture
-        self._side = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
+        self._side_stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
 
     def load(self, indices: Tensor, noise: Mapping[str, Tensor], first: int) -> None:
         """Copy a chunk's indices and noise into the buffers; the next update takes row `first`."""
@@ -54,21 +55,21 @@ class Program:
         """Do the next update."""
         if self.eager:
             self._update(phase)
-        elif self._side is None:
-            self._captured(phase)
+        elif self._side_stream is None:
+            self._run_captured(phase)
         elif phase in self._graphs:
             self._graphs[phase].replay()
         else:
-            self._warm_up(phase, self._side)
+            self._warm_up(phase, self._side_stream)
         self.counts.update(self._names[phase])
 
-    def _captured(self, phase: Hashable) -> None:
-        """Do an update on the CPU: the first of a phase as it is, the next ones recorded, the rest replayed.
+    def _run_captured(self, phase: Hashable) -> None:
+        """Do an update on the CPU: the first of a phase eagerly, the next ones recorded, the rest replayed.
 
         Every RECORD_EVERY-th is recorded again, so that an update that changes later on is noticed.
         """
         done = self._done[phase] = self._done.get(phase, 0) + 1
-        if done > RECORDED and done % RECORD_EVERY:
+        if done > RECORDED_UPDATES and done % RECORD_EVERY:
             with torch.inference_mode():
                 self._recordings[phase].replay()
             return
@@ -86,9 +87,9 @@ class Program:
         if recording is not None:
             if phase in self._recordings and not recording.same_as(self._recordings[phase]):
                 reason = reason or f"is not the same at every update of phase {phase!r}"
-            if done <= RECORDED:  # a later one is only compared: copying it into other buffers would gain nothing
+            if done <= RECORDED_UPDATES:  # a later recording is only compared with the one in use
                 self._recordings[phase] = recording
-        if reason and done > RECORDED:
+        if reason and done > RECORDED_UPDATES:
             name = type(self.algorithm).__name__
             raise OffbenchError(
                 f"{name}.update {reason} after {done:,} updates; let `phase` tell apart what differs, or set "
@@ -104,7 +105,7 @@ class Program:
         inform(f"{name}.update {reason}: updates run without capture, which is slower")
 
     def _warm_up(self, phase: Hashable, side: torch.cuda.Stream) -> None:
-        """Do one of the first updates of a phase as it is; after a few, capture the phase for those to come."""
+        """Do one of the first updates of a phase eagerly; after a few, capture the phase for the later ones."""
         done = self._done[phase] = self._done.get(phase, 0) + 1
         before = attributes(self.algorithm)
         side.wait_stream(torch.cuda.current_stream(self.device))

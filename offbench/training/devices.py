@@ -34,12 +34,12 @@ class Machine:
 
     @property
     def processes(self) -> int:
-        """Jobs that train at a time; on a GPU one, whose evaluations have the workers."""
+        """Number of jobs that train at a time: one on a GPU, whose evaluations use the workers."""
         return self.workers if self.device == "cpu" else 1
 
 
 def pick_machine(device: str, workers: int | None, stack: int | str, precision: str) -> Machine:
-    """Return the machine that these options mean.
+    """Return the machine that these options describe.
 
     Args:
         device: auto, cpu, cuda or cuda:N.
@@ -63,10 +63,10 @@ def pick_device(device: str) -> str:
     """
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
-    kind, _, index = device.partition(":")
-    if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
+    device_type, _, index = device.partition(":")
+    if device_type not in ("cpu", "cuda") or (index and not index.isdigit()):
         raise OffbenchError(f"device must be auto, cpu, cuda or cuda:N, not {device!r}")
-    if kind == "cuda" and (not torch.cuda.is_available() or int(index or 0) >= torch.cuda.device_count()):
+    if device_type == "cuda" and (not torch.cuda.is_available() or int(index or 0) >= torch.cuda.device_count()):
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         raise OffbenchError(f"no device {device}: PyTorch {torch.__version__} sees {count} GPUs; use --device cpu")
     return device

@@ -17,12 +17,12 @@ import torch
 
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
-from offbench.common.provenance import made_with
+from offbench.common.provenance import training_platform
 from offbench.common.settings import fields
 from offbench.common.terminal import inform
 from offbench.data import transitions
 from offbench.data.minari_store import provenance
-from offbench.data.recorded_env import say_margin
+from offbench.data.recorded_env import report_margin_rule
 from offbench.data.transitions import Transitions
 from offbench.envs.environments import checked_spec, same_environment
 from offbench.envs.recipes import d4rl_reference
@@ -60,7 +60,7 @@ def check_datasets(datasets: Datasets) -> None:
         if data.env_spec:
             checked_spec(data.env_spec, name, data.observations.shape[1], data.low, data.high)
             if data.evaluated_in is None:
-                say_margin(name, data.metadata, data.env_spec)
+                report_margin_rule(name, data.metadata, data.env_spec)
             warn_other_physics(name, provenance(data.metadata).versions, data.env_spec)
         else:
             inform(
@@ -77,9 +77,9 @@ def group(specs: Sequence[RunSpec], datasets: Datasets, machine: Machine) -> lis
     for spec in specs:
         by_times.setdefault(spec.times, []).append(spec)
     for same_times in by_times.values():
-        alike = _alike(same_times, datasets)
-        share = max(1, machine.processes // len(alike))  # of the processes, for each group
-        for runs in alike:
+        compatible = _compatible_groups(same_times, datasets)
+        share = max(1, machine.processes // len(compatible))  # of the processes, for each group
+        for runs in compatible:
             size = machine.stack
             if isinstance(size, str):
                 size = stack_size(runs[0], datasets[runs[0].dataset], machine.device)
@@ -113,7 +113,7 @@ def stack_size(spec: RunSpec, data: Transitions, device: str) -> int:
     return max(1, int((MEMORY_SHARE * free - peaks[0]) / cost) + 1)
 
 
-def _alike(specs: Sequence[RunSpec], datasets: Datasets) -> list[list[RunSpec]]:
+def _compatible_groups(specs: Sequence[RunSpec], datasets: Datasets) -> list[list[RunSpec]]:
     """Group runs by algorithm, environment, shapes, precision and the settings that cannot differ within a stack."""
     groups: list[tuple[object, list[RunSpec]]] = []
     for spec in specs:
@@ -194,7 +194,7 @@ def _check_environment(spec: RunSpec, data: Transitions) -> None:
 def _check_evaluations(spec: RunSpec) -> None:
     """Refuse a run that lacks an evaluation before its newest checkpoint: resuming it would give another score."""
     newest = max(checkpoints.steps(spec.folder), default=0)
-    last = (newest - 1) // spec.eval_every * spec.eval_every  # that of `newest` itself may have been under way
+    last = (newest - 1) // spec.eval_every * spec.eval_every  # the one of `newest` itself may not have finished
     if last > 0 and last not in spec.run.evaluations():
         raise OffbenchError(
             f"{spec.run.evaluations_path} lacks the evaluation of step {last}; put the file back, or delete the "
@@ -203,7 +203,7 @@ def _check_evaluations(spec: RunSpec) -> None:
 
 
 def run_config(spec: RunSpec, data: Transitions, device: str, command: str) -> RunConfig:
-    """Return what config.json says of a run that is started now."""
+    """Return the config.json of a run that starts now."""
     return RunConfig(
         algorithm=spec.algorithm,
         variant=spec.variant,
@@ -220,5 +220,5 @@ def run_config(spec: RunSpec, data: Transitions, device: str, command: str) -> R
         env_spec=data.env_spec,
         command=command.encode("utf-8", "backslashreplace").decode(),  # a path may hold bytes that are not UTF-8
         code=code_of(spec.algorithm),
-        **made_with(device, spec.precision),
+        **training_platform(device, spec.precision),
     )

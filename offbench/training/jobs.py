@@ -17,12 +17,12 @@ from types import TracebackType
 
 from offbench.common.errors import OffbenchError
 from offbench.common.interrupts import announce_stop
-from offbench.common.processes import quiet_start, start_worker
+from offbench.common.processes import start_worker, uninterrupted_start
 from offbench.common.progress import Progress
 from offbench.common.text import printable
 from offbench.training.devices import arithmetic
 from offbench.training.grouping import load_datasets
-from offbench.training.registry import failure
+from offbench.training.registry import describe_failure
 from offbench.training.spec import Job
 from offbench.training.trainer import STOPPED, Report, Trainer
 
@@ -92,9 +92,9 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self, exception_type: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.progress.__exit__(kind, error, trace)
+        self.progress.__exit__(exception_type, error, trace)
 
     def report(self, index: int, step: int, note: str) -> None:
         """Show that a job is at `step`, and say where it resumed and where it was stopped.
@@ -102,10 +102,10 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
         It must be called for each of a job's reports.
         """
         if index not in self.steps and step:
-            self.progress.say(f"{self.titles[index]}: resuming from step {step:,}")
+            self.progress.print_line(f"{self.titles[index]}: resuming from step {step:,}")
         self.update(index, step, note)
         if note == STOPPED:
-            self.progress.say(f"{self.titles[index]}: stopped at step {step:,}, checkpoint saved")
+            self.progress.print_line(f"{self.titles[index]}: stopped at step {step:,}, checkpoint saved")
 
     def update(self, index: int, step: int, note: str) -> None:
         """Show that a job is at `step`."""
@@ -123,7 +123,7 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
 
 
 def _train_here(job: Job, index: int, progress: JobProgress) -> list[str]:
-    if job.is_over:
+    if job.deadline_passed:
         return []
     try:
         return train_job(job, lambda step, note: progress.report(index, step, note))
@@ -144,7 +144,7 @@ class _Pool(contextlib.AbstractContextManager["_Pool"]):
         context = multiprocessing.get_context("spawn")
         receiver, sender = context.Pipe(duplex=False)
         process = context.Process(target=_worker, args=(job, sender, os.getpid()), daemon=False)
-        with quiet_start():
+        with uninterrupted_start():
             process.start()
         sender.close()
         self.active[receiver] = (index, process)
@@ -154,11 +154,11 @@ class _Pool(contextlib.AbstractContextManager["_Pool"]):
         receiver.close()
         process.join()
 
-    def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
+    def __exit__(self, exception_type: type[BaseException] | None, *_error: object) -> None:
         processes = [process for _, process in self.active.values()]
         for process in processes:
             process.terminate()
-        if kind is KeyboardInterrupt:
+        if exception_type is KeyboardInterrupt:
             announce_stop()
         try:
             for receiver, (index, _) in list(self.active.items()):
@@ -178,7 +178,7 @@ def _train_in_processes(jobs: Sequence[Job], processes: int, pool: _Pool) -> Ite
     while waiting or pool.active:
         while waiting and len(pool.active) < processes:
             index, job = waiting.popleft()
-            if not job.is_over:
+            if not job.deadline_passed:
                 pool.start(index, job)
         # if all remaining jobs are over, there is no process to wait for
         for receiver in wait(list(pool.active)) if pool.active else ():
@@ -193,7 +193,7 @@ def _train_in_processes(jobs: Sequence[Job], processes: int, pool: _Pool) -> Ite
                 pool.progress.report(index, step, note)
                 continue
             if note not in traces:  # all jobs may fail at the same line
-                pool.progress.progress.say(printable(note.rstrip()))
+                pool.progress.progress.print_line(printable(note.rstrip()))
                 traces.add(note)
             yield from lines
             pool.end(receiver)
@@ -208,5 +208,5 @@ def _worker(job: Job, sender: Connection, parent: int) -> None:
     except OffbenchError as error:
         lines = [str(error)]
     except Exception as error:
-        lines = [f"{job.title}: {failure(error, traces.append)}"]
+        lines = [f"{job.title}: {describe_failure(error, traces.append)}"]
     sender.send((None, "".join(traces), lines))

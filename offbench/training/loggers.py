@@ -46,29 +46,29 @@ class Destinations:
                 raise OffbenchError(f"--{package} needs the package {package}: pip install 'offbench[{package}]'")
 
 
-NOWHERE = Destinations()
+NO_DESTINATIONS = Destinations()
 
 
 class Loggers(contextlib.AbstractContextManager["Loggers"]):
     """The live views of a job's runs, open while it trains."""
 
-    def __init__(self, runs: Sequence[Run], show: Destinations) -> None:
-        self.runs, self.show = list(runs), show
+    def __init__(self, runs: Sequence[Run], destinations: Destinations) -> None:
+        self.runs, self.destinations = list(runs), destinations
         self.sinks: list[list[TensorBoard | WandB]] = [[] for _ in runs]
 
     def __enter__(self) -> Loggers:
         try:
             for run, sinks in zip(self.runs, self.sinks, strict=True):
-                if self.show.tensorboard:
+                if self.destinations.tensorboard:
                     sinks.append(TensorBoard(run))
-                if self.show.wandb is not None:
-                    sinks.append(WandB(run, self.show.wandb))
+                if self.destinations.wandb is not None:
+                    sinks.append(WandB(run, self.destinations.wandb))
         except BaseException:
             self._close()  # those of the runs before
             raise
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, _: object, __: TracebackType | None) -> None:
+    def __exit__(self, exception_type: type[BaseException] | None, _: object, __: TracebackType | None) -> None:
         self._close()
 
     def _close(self) -> None:

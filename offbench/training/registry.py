@@ -1,7 +1,7 @@
 """Algorithms by name: ours and third parties', through the entry-point group `offbench.algos`, and a user's own.
 
-A user's own algorithm is a class, or a file `./my_algo.py:ReBRAC`; `use` gives it the name of its class. Processes
-started later find it by that name in $OFFBENCH_OWN_ALGORITHMS, as long as its module can be imported there.
+A user's own algorithm is a class, or a file `./my_algo.py:ReBRAC`; `register` gives it the name of its class.
+Processes started later find it by that name in $OFFBENCH_OWN_ALGORITHMS, as long as its module can be imported there.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, drawing_variable, unknown
+from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, rendering_variable, unknown
 from offbench.common.files import OPEN_FILES, READ_REMEDIES, JsonObject, is_exhausted, is_out_of_memory
 from offbench.common.terminal import warn
 
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
 
 GROUP = "offbench.algos"
-OWN = "OFFBENCH_OWN_ALGORITHMS"  # {name: "module:class"} as JSON, for the processes that this one starts
+OWN_VARIABLE = "OFFBENCH_OWN_ALGORITHMS"  # {name: "module:class"} as JSON, for the processes that this one starts
 _own: dict[str, type[Algorithm]] = {}  # this process's own algorithms
 
 
-NEEDED = ("batch_size", "normalize")  # settings that the training itself reads
-# Settings of earlier versions, and the values under which a run trains as without them. bdb_plus has some of bdb's
+REQUIRED_SETTINGS = ("batch_size", "normalize")  # settings that the training itself reads
+# Settings of earlier versions, each with the value that has no effect. bdb_plus has some of bdb's
 # now; the others lowered the scores and were removed (docs/results.md).
 REMOVED: JsonObject = {"uncertainty": "absolute", "uncertainty_scale": 1.0, "cloning_steps": 0}
 MOVED: JsonObject = {
@@ -69,17 +69,17 @@ def algorithm_names() -> list[str]:
     return sorted(_entry_points())
 
 
-def failure(error: Exception, show: Callable[[str], object] | None = None) -> str:
-    """Return what has gone wrong and what to do about it, whatever was raised.
+def describe_failure(error: Exception, write_traceback: Callable[[str], object] | None = None) -> str:
+    """Return a line that says what went wrong and what to do about it, for any exception.
 
     Args:
-        show: receives the traceback (None: it goes to stderr) if $OFFBENCH_TRACEBACK is set, or if an installed
-            algorithm has the fault: whoever writes one needs it.
+        write_traceback: receives the traceback (None: it goes to stderr) if $OFFBENCH_TRACEBACK is set, or if the
+            error arose in a third party's algorithm, whose author needs it.
     """
     expected = isinstance(error, OffbenchError | OSError) or is_out_of_memory(error)
     algorithm = None if expected else _third_party(error.__traceback__)
     if algorithm or os.environ.get("OFFBENCH_TRACEBACK"):
-        (show or sys.stderr.write)("".join(traceback.format_exception(error)))
+        (write_traceback or sys.stderr.write)("".join(traceback.format_exception(error)))
     if isinstance(error, OffbenchError):
         return str(error)
     if is_out_of_memory(error):
@@ -89,7 +89,7 @@ def failure(error: Exception, show: Callable[[str], object] | None = None) -> st
         remedies = READ_REMEDIES if error.filename else OPEN_FILES
         remedy = f"; {remedies[error.errno]}" if error.errno in remedies else ""
         return f"{where}{error.strerror or error}{remedy} ({SHOW_TRACEBACK})"
-    if not algorithm and (variable := drawing_variable(error)):
+    if not algorithm and (variable := rendering_variable(error)):
         return f"MuJoCo does not load with {variable} ({type(error).__name__}: {error}); unset it or choose another"
     frame = traceback.extract_tb(error.__traceback__)[-1]
     what = f"{type(error).__name__}: {error} (at {frame.filename}:{frame.lineno})"
@@ -101,7 +101,7 @@ def failure(error: Exception, show: Callable[[str], object] | None = None) -> st
 def _third_party(trace: types.TracebackType | None) -> str | None:
     """Return the package or module of an algorithm, not offbench's own, that a traceback leads through."""
     packages = {point.module.partition(".")[0] for points in _entry_points().values() for point in points}
-    packages |= {kind.__module__.partition(".")[0] for kind in _own.values()} - {"__main__"}
+    packages |= {cls.__module__.partition(".")[0] for cls in _own.values()} - {"__main__"}
     while trace is not None:
         package = str(trace.tb_frame.f_globals.get("__name__", "")).partition(".")[0]
         if package in packages - {"offbench"}:
@@ -111,18 +111,18 @@ def _third_party(trace: types.TracebackType | None) -> str | None:
 
 
 def load_algorithm(name: str) -> type[Algorithm]:
-    """Return an algorithm's class by its name, that of a package or one that `use` has returned.
+    """Return an algorithm's class by its name, that of a package or one that `register` has returned.
 
-    A name may come from a run folder that was handed over, so no file is imported here.
+    A name may come from another person's run folder, so no file is imported here.
 
     Raises:
-        OffbenchError: it is unknown, two packages have one of that name, it does not import, or has no sound Config.
+        OffbenchError: it is unknown, two packages have one of that name, it does not import, or has no valid Config.
     """
     if name in _own:
         return _own[name]
     points = _entry_points()
     if name not in points:
-        own = json.loads(os.environ.get(OWN, "{}"))
+        own = json.loads(os.environ.get(OWN_VARIABLE, "{}"))
         if name not in own:
             raise unknown("algorithm", name, points)
         module, _, qualname = own[name].partition(":")
@@ -131,29 +131,29 @@ def load_algorithm(name: str) -> type[Algorithm]:
     if others:
         raise OffbenchError(f"two algorithms are named {name!r}: {point.value} and {others[0].value}; rename yours")
     try:
-        kind = point.load()
+        cls = point.load()
     except (Exception, SystemExit) as error:  # whatever its code raises
         if is_exhausted(error):
             raise
         why = f"{type(error).__name__}: {error}"
         raise OffbenchError(f"algorithm {name!r} ({point.value}) does not import: {why} ({SHOW_TRACEBACK})") from error
-    return _checked(kind, f"algorithm {name!r} ({point.value})")
+    return _check_algorithm(cls, f"algorithm {name!r} ({point.value})")
 
 
-def use(algorithm: str | type) -> str:
-    """Return the name of an algorithm in folders, tables and `load_algorithm`.
+def register(algorithm: str | type) -> str:
+    """Make a user's own algorithm known by name; return the name for folders, tables and `load_algorithm`.
 
     Args:
         algorithm: a registered name, a file `./my_algo.py:ReBRAC` (the class may be left out if it is the only
             algorithm there), or a class.
 
     Raises:
-        OffbenchError: no such file or class, no sound algorithm, or a name that another algorithm has.
+        OffbenchError: no such file or class, no valid algorithm, or a name that another algorithm has.
     """
     if isinstance(algorithm, str) and not re.search(r"\.py(:|$)", algorithm):
         return algorithm
-    kind = _from_file(algorithm) if isinstance(algorithm, str) else algorithm
-    name, value = kind.__name__, f"{kind.__module__}:{kind.__qualname__}"
+    cls = _from_file(algorithm) if isinstance(algorithm, str) else algorithm
+    name, value = cls.__name__, f"{cls.__module__}:{cls.__qualname__}"
     for points in _entry_points().values():
         for point in points:
             if point.value == value:
@@ -164,11 +164,11 @@ def use(algorithm: str | type) -> str:
     other = _own.get(name)
     if other is not None and f"{other.__module__}:{other.__qualname__}" != value:
         raise OffbenchError(
-            f"two algorithms are named {name!r}, in {other.__module__} and {kind.__module__}; rename one"
+            f"two algorithms are named {name!r}, in {other.__module__} and {cls.__module__}; rename one"
         )
-    _own[name] = _checked(kind, where)
+    _own[name] = _check_algorithm(cls, where)
     if not is_local(name):
-        os.environ[OWN] = json.dumps(json.loads(os.environ.get(OWN, "{}")) | {name: value})
+        os.environ[OWN_VARIABLE] = json.dumps(json.loads(os.environ.get(OWN_VARIABLE, "{}")) | {name: value})
     return name
 
 
@@ -179,8 +179,8 @@ def own_algorithm(name: str) -> type[Algorithm] | None:
 
 def is_local(name: str) -> bool:
     """Return whether an algorithm is a class that other processes cannot import: of a notebook, script or function."""
-    kind = _own.get(name)
-    return kind is not None and (kind.__module__ == "__main__" or "<locals>" in kind.__qualname__)
+    cls = _own.get(name)
+    return cls is not None and (cls.__module__ == "__main__" or "<locals>" in cls.__qualname__)
 
 
 def _from_file(reference: str) -> type[Algorithm]:
@@ -204,36 +204,36 @@ def _from_file(reference: str) -> type[Algorithm]:
         ) from None
     if Path(getattr(module, "__file__", None) or "").resolve() != path:
         raise OffbenchError(f"{text}: Python has another module {path.stem!r}; rename the file")
-    kinds = {
+    classes = {
         key: value
         for key, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, Algorithm) and value.__module__ == module.__name__
     }
-    if name in kinds:
-        return kinds[name]
-    if name or len(kinds) != 1:
-        what = f"no algorithm {name!r}" if name else "several algorithms" if kinds else "no algorithm"
-        what += "" if kinds else ", a subclass of offbench.algorithm.Algorithm"
-        hint = f"; name one: {text}:{' or :'.join(kinds)}" if kinds else ""
+    if name in classes:
+        return classes[name]
+    if name or len(classes) != 1:
+        what = f"no algorithm {name!r}" if name else "several algorithms" if classes else "no algorithm"
+        what += "" if classes else ", a subclass of offbench.algorithm.Algorithm"
+        hint = f"; name one: {text}:{' or :'.join(classes)}" if classes else ""
         raise OffbenchError(f"{text} has {what}{hint}")
-    return next(iter(kinds.values()))
+    return next(iter(classes.values()))
 
 
-def _checked(kind: type, what: str) -> type[Algorithm]:
-    """Return a class if it is an algorithm that can train. Raises OffbenchError if not."""
-    from offbench.algorithm.interface import Algorithm  # imports PyTorch, which those who ask for names do without
+def _check_algorithm(cls: type, what: str) -> type[Algorithm]:
+    """Return `cls` if it is an Algorithm with a valid Config, else raise an OffbenchError that begins with `what`."""
+    from offbench.algorithm.interface import Algorithm  # imports PyTorch, which listing the names does not need
 
-    if not (isinstance(kind, type) and issubclass(kind, Algorithm)):
+    if not (isinstance(cls, type) and issubclass(cls, Algorithm)):
         raise OffbenchError(f"{what} must be a subclass of offbench.algorithm.Algorithm; see docs/extending.md")
-    config = getattr(kind, "Config", None)
+    config = getattr(cls, "Config", None)
     if not (isinstance(config, type) and dataclasses.is_dataclass(config)):
         raise OffbenchError(f"{what}: Config must be a dataclass of settings")
-    for needed in NEEDED:
+    for needed in REQUIRED_SETTINGS:
         if needed not in {field.name for field in dataclasses.fields(config)}:
             raise OffbenchError(f"{what}: its Config lacks the setting {needed}")
     if config.__hash__ is None:
         raise OffbenchError(f"{what}: Config must be frozen: @dataclass(frozen=True)")
-    return kind
+    return cls
 
 
 def current_settings(algorithm: str, settings: JsonObject, where: str) -> JsonObject:

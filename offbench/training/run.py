@@ -28,21 +28,21 @@ from offbench.common.files import (
     damage,
     delete,
     exclusive_lock,
+    open_regular,
     read_json,
-    regular,
     remove_leftovers,
     write_bytes,
     write_json,
 )
-from offbench.common.provenance import Hardware, MadeWith
-from offbench.common.scores import LARGEST, Evaluations, are_references, check_steps
+from offbench.common.provenance import Hardware, TrainingPlatform
+from offbench.common.scores import LARGEST_VALUE, Evaluations, are_references, check_steps
 from offbench.common.settings import read_back
 from offbench.training.registry import current_settings
 from offbench.training.source_code import changes
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 FORMAT = "offbench-run-1"
-REPEAT = "delete the run to repeat it"
+DELETE_TO_REPEAT = "delete the run to repeat it"
 TRAIN_ANEW = "delete that run (`train` does with --fresh) or give another --runs"
 DIGITS = 8  # of a content hash, where a table must tell two contents of one dataset id apart
 MUST_MATCH = ("algorithm", "settings", "dataset", "dataset_sha256", "seed", "eval_every", "eval_episodes")
@@ -50,10 +50,10 @@ MUST_MATCH = ("algorithm", "settings", "dataset", "dataset_sha256", "seed", "eva
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
-    """What trained a run from `step` on: what its numbers depend on in addition to settings and seed.
+    """The platform that trained a run from `step` on, on which its results depend besides settings and seed.
 
     Attributes:
-        device, precision, versions, hardware: as in offbench.common.provenance.made_with.
+        device, precision, versions, hardware: as in offbench.common.provenance.training_platform.
     """
 
     step: int = 0
@@ -100,13 +100,13 @@ class RunConfig:
     label: str = ""
 
     def __post_init__(self) -> None:
-        """Raise OffbenchError for numbers that no run has."""
+        """Raise OffbenchError for values that no run has."""
         if self.format != FORMAT:
             raise OffbenchError(f"format is {self.format[:40]!r}, not {FORMAT}: another version of offbench wrote it")
         for name in ("algorithm", "variant", "dataset", "label"):
             if len(getattr(self, name).splitlines()) > 1:
                 raise OffbenchError(f"{name} has several lines, which would be rows of their own in tables")
-        if self.seed < 0 or not 0 <= self.steps < LARGEST:
+        if self.seed < 0 or not 0 <= self.steps < LARGEST_VALUE:
             raise OffbenchError(f"seed {self.seed} or steps {self.steps} is out of range")
         if self.env_spec is not None:
             try:
@@ -156,7 +156,7 @@ class Run:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the directory for this process, rid of leftovers. Raises OffbenchError if another one trains it."""
+        """Lock the folder and delete leftovers. Raises OffbenchError if another process trains the run."""
         with exclusive_lock(self.folder / ".lock", f"{self.folder} is being trained"):
             remove_leftovers(self.folder)
             yield
@@ -167,31 +167,31 @@ class Run:
             raise OffbenchError(
                 f"no run in {self.folder} (no config.json); a run is RUNS/DATASET/ALGORITHM/VARIANT/seed-N"
             )
-        values = read_json(self.config_path, REPEAT)
+        values = read_json(self.config_path, DELETE_TO_REPEAT)
         later = values.get("sessions")
         for session in [values, *(later if isinstance(later, list) else [])]:
             if isinstance(session, dict):  # earlier versions wrote tf32 (true or false) instead of precision
                 session.setdefault("precision", "tf32" if session.get("tf32") else "float32")
-        return read_back(RunConfig, values, self.config_path, REPEAT)
+        return read_back(RunConfig, values, self.config_path, DELETE_TO_REPEAT)
 
     def check(self, config: RunConfig) -> None:
         """Check that the folder can be claimed; write nothing.
 
         Raises:
-            OffbenchError: it holds another run that has got to a checkpoint, or one whose config.json is gone.
+            OffbenchError: it holds another run with a checkpoint, or a run without its config.json.
         """
         if self._has_results and not self.config_path.exists():
             raise OffbenchError(f"{self.folder} holds a run without its config.json; put it back, or delete the run")
-        if self._has_results and (reason := self._refusal(config)):
+        if self._has_results and (reason := self._mismatch(config)):
             raise OffbenchError(f"{reason}; {TRAIN_ANEW}")
 
     def check_claimed(self, config: RunConfig) -> None:
         """Check, with the lock held, that this is the run of `config`, of any code. Raises OffbenchError if not."""
-        if reason := self._refusal(dataclasses.replace(config, code=self.config().code)):
+        if reason := self._mismatch(dataclasses.replace(config, code=self.config().code)):
             raise OffbenchError(f"{reason}; run the command again")
 
     def claim(self, config: RunConfig) -> None:
-        """Write config.json, unless this very run is there.
+        """Write config.json, unless the folder holds this run already.
 
         A run that stopped before its first checkpoint starts over.
 
@@ -199,7 +199,7 @@ class Run:
             OffbenchError: as `check`.
         """
         self.check(config)
-        if self.config_path.exists() and self._refusal(config):
+        if self.config_path.exists() and self._mismatch(config):
             self.clear()
         if self.config_path.exists():
             return
@@ -220,7 +220,7 @@ class Run:
         """Whether the folder has what training writes; a run that stopped before that starts over."""
         return self.has_checkpoint or self.evaluations_path.exists() or self.policy_path.exists()
 
-    def _refusal(self, config: RunConfig) -> str:
+    def _mismatch(self, config: RunConfig) -> str:
         """Return why the run in this folder is not the one of `config`, "" if it is."""
         existing = self.config()
         for key in MUST_MATCH:
@@ -247,21 +247,21 @@ class Run:
                 for path in (*early, *late, self.config_path):
                     delete(path)
 
-    def begin(self, step: int, steps: int, made: MadeWith) -> None:
-        """Note in config.json that the run is trained from `step` to `steps`, and with what, if that has changed.
+    def begin(self, step: int, steps: int, platform: TrainingPlatform) -> None:
+        """Record in config.json that the run trains from `step` to `steps`, and the platform if it has changed.
 
         Args:
-            made: from offbench.common.provenance.made_with.
+            platform: from offbench.common.provenance.training_platform.
         """
-        config, written = self.config(), read_json(self.config_path, REPEAT)
+        config, written = self.config(), read_json(self.config_path, DELETE_TO_REPEAT)
         changed = dict(written, steps=max(steps, config.steps))
-        if dataclasses.replace(config.history[-1], step=step) != (session := Session(step=step, **made)):
+        if dataclasses.replace(config.history[-1], step=step) != (session := Session(step=step, **platform)):
             changed["sessions"] = [*written.get("sessions", []), dataclasses.asdict(session)]
         if changed != written:
             write_json(self.config_path, changed)
 
     def mark_diverged(self, step: int, tensor: str) -> None:
-        """Note that the run cannot continue: `tensor` held NaN or infinity at `step`."""
+        """Record that the run cannot continue: `tensor` held NaN or infinity at `step`."""
         write_json(self.folder / "diverged.json", {"step": step, "tensor": tensor})
 
     @property
@@ -299,10 +299,10 @@ class Run:
                 raise DamagedError(f"{self.evaluations_path} is missing; put it back, or delete the run to repeat it")
             return {}
         config = self.config() if self.config_path.exists() else None
-        last, count = (config.steps, config.eval_episodes) if config else (LARGEST, 0)
+        last, count = (config.steps, config.eval_episodes) if config else (LARGEST_VALUE, 0)
         evaluations: dict[int, list[tuple[float, int]]] = {}
-        with damage(str(self.evaluations_path), "is damaged", REPEAT):
-            with open(self.evaluations_path, newline="", encoding="utf-8", opener=regular) as file:
+        with damage(str(self.evaluations_path), "is damaged", DELETE_TO_REPEAT):
+            with open(self.evaluations_path, newline="", encoding="utf-8", opener=open_regular) as file:
                 reader = csv.DictReader(file, strict=True)
                 if tuple(reader.fieldnames or ()) != EVALUATION_COLUMNS:
                     raise ValueError(f"its columns are {reader.fieldnames}")
@@ -310,7 +310,7 @@ class Run:
                     if None in row or None in row.values():
                         raise ValueError(f"line {reader.line_num} does not have {len(EVALUATION_COLUMNS)} cells")
                     value, step = _number(row["return"]), _count(row["step"])
-                    if not abs(value) < LARGEST:
+                    if not abs(value) < LARGEST_VALUE:
                         raise ValueError(f"a return is {value}")
                     if not 0 < step <= last:
                         raise ValueError(f"step {step} of a run of {last} steps")
@@ -347,12 +347,12 @@ class Run:
         if not path.exists():
             return []
         with (
-            damage(str(path), "is damaged", REPEAT),
-            open(path, newline="", encoding="utf-8", opener=regular) as file,
+            damage(str(path), "is damaged", DELETE_TO_REPEAT),
+            open(path, newline="", encoding="utf-8", opener=open_regular) as file,
         ):
             rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
             steps = [row["step"] for row in rows if "step" in row]
-            if not all(low < high for low, high in itertools.pairwise([-1.0, *steps, LARGEST])):
+            if not all(low < high for low, high in itertools.pairwise([-1.0, *steps, LARGEST_VALUE])):
                 raise ValueError("its steps are out of order or out of range")
             return rows
 
@@ -381,20 +381,20 @@ def find_runs(root: Path) -> list[Run]:
     A folder that this user may not read counts as a run that cannot be read. The config.json files of other programs
     are ignored.
     """
-    closed: list[Path] = []
+    unreadable_folders: list[Path] = []
 
     def unreadable(error: OSError) -> None:
         if not isinstance(error, FileNotFoundError | NotADirectoryError):
-            closed.append(Path(error.filename))
+            unreadable_folders.append(Path(error.filename))
 
     walk = os.walk(root, onerror=unreadable)
     paths = sorted(Path(folder) / "config.json" for folder, _, files in walk if "config.json" in files)
-    return [*(Run(path.parent) for path in paths if _is_run(path)), *map(Run, closed)]
+    return [*(Run(path.parent) for path in paths if _is_run(path)), *map(Run, unreadable_folders)]
 
 
 def _is_run(path: Path) -> bool:
     try:
-        config = read_json(path, REPEAT)
+        config = read_json(path, DELETE_TO_REPEAT)
     except OffbenchError:
         return path.parent.name.startswith("seed-")
     return config.get("format") == FORMAT or path.parent.name.startswith("seed-")

@@ -1,11 +1,11 @@
 """The code of an algorithm, as config.json identifies it: a hash of each file that it is made of.
 
-A hash leaves out comments, docstrings and blank lines, which train nothing. The files are
+A hash leaves out comments, docstrings and blank lines, which do not affect training. The files are:
 
-    of offbench's own algorithms   the algorithm's file
-    of a package                   all files of the package, and the version that is installed
-    of a file or a class           the file, and the files in its folder that it imports
-    of a script's or notebook's    the source of the class, its Config and its bases
+    algorithm of offbench             its file
+    algorithm of a package            all files of the package, and the installed version
+    algorithm in a user's own file    the file, and the files in its folder that it imports
+    class of a script or notebook     the source of the class, its Config and its bases
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ def code_of(algorithm: str) -> dict[str, str]:
 
     It is empty for a class whose source Python does not know, one that was typed at a prompt.
     """
-    kind = load_algorithm(algorithm)
-    if kind not in _codes:
-        _codes[kind] = _code_of(kind)
-    return _codes[kind]
+    algorithm_class = load_algorithm(algorithm)
+    if algorithm_class not in _codes:
+        _codes[algorithm_class] = _code_of(algorithm_class)
+    return _codes[algorithm_class]
 
 
-def _code_of(kind: type[Algorithm]) -> dict[str, str]:
+def _code_of(algorithm_class: type[Algorithm]) -> dict[str, str]:
     hashes: dict[str, str] = {}
-    for cls in _classes(kind):
+    for cls in _classes(algorithm_class):
         module = sys.modules.get(cls.__module__)
         file = Path(getattr(module, "__file__", None) or "")
         package = cls.__module__.partition(".")[0]
         if cls.__module__ == "__main__" or not file.is_file():
-            hashes |= {one.__qualname__: text for one in (cls, kind.Config) if (text := _source_hash(one))}
+            hashes |= {one.__qualname__: text for one in (cls, algorithm_class.Config) if (text := _source_hash(one))}
         elif package == "offbench":
             hashes[file.name] = _hash(file)
         elif folders := getattr(sys.modules[package], "__path__", None):  # several of a namespace package
@@ -64,18 +64,18 @@ def _code_of(kind: type[Algorithm]) -> dict[str, str]:
     return dict(sorted(hashes.items()))
 
 
-def _classes(kind: type[Algorithm]) -> Sequence[type]:
+def _classes(algorithm_class: type[Algorithm]) -> Sequence[type]:
     """Return an algorithm's class and its bases below `Algorithm`."""
-    from offbench.algorithm.interface import Algorithm  # imports PyTorch, which those who read config.json do without
+    from offbench.algorithm.interface import Algorithm  # imports PyTorch, which reading config.json does not need
 
-    return kind.__mro__[: kind.__mro__.index(Algorithm)]
+    return algorithm_class.__mro__[: algorithm_class.__mro__.index(Algorithm)]
 
 
 def own_modules(algorithm: str) -> list[types.ModuleType]:
     """Return the modules of a user's own algorithm that no package brings: its file's, and those beside it."""
-    kind = own_algorithm(algorithm)
+    algorithm_class = own_algorithm(algorithm)
     files: dict[Path, None] = {}
-    for cls in _classes(kind) if kind else ():
+    for cls in _classes(algorithm_class) if algorithm_class else ():
         file = Path(getattr(sys.modules.get(cls.__module__), "__file__", None) or "")
         if "." not in cls.__module__ and file.is_file() and not _version(cls.__module__):
             _imported(file, file.parent, files)
@@ -89,10 +89,10 @@ def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     if not set(before) & set(now):
         return f"{', '.join(before)}, not {', '.join(now)}"
     differ = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-    return ", ".join(f"{name} {_how(before.get(name), now.get(name))}" for name in differ)
+    return ", ".join(f"{name} {_describe_change(before.get(name), now.get(name))}" for name in differ)
 
 
-def _how(before: str | None, now: str | None) -> str:
+def _describe_change(before: str | None, now: str | None) -> str:
     if now is None:
         return "is gone"
     if before is None:
@@ -160,7 +160,7 @@ def _text(file: Path) -> str:
 def _hash(file: Path) -> str:
     try:
         return _source(_text(file))
-    except (SyntaxError, UnicodeDecodeError):  # a template, say: a file of a package that is never imported
+    except (SyntaxError, UnicodeDecodeError):  # such as a template in a package, which is never imported
         return sha256(file.read_bytes())
 
 

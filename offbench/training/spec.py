@@ -18,8 +18,8 @@ from urllib.parse import quote
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import JsonObject, sha256
 from offbench.common.settings import check, fields, setting
-from offbench.training.loggers import NOWHERE, Destinations
-from offbench.training.registry import load_algorithm, use
+from offbench.training.loggers import NO_DESTINATIONS, Destinations
+from offbench.training.registry import load_algorithm, register
 from offbench.training.run import Run
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class Job:
         device: PyTorch's name of it.
         workers: evaluation processes; 0 evaluates in the training process.
         deadline: `time.time()` after which the job stops at the next chunk, with a checkpoint; None for never.
-        show: live views of the training.
+        destinations: live views of the training.
         cost: seconds per update of one run, relative to the other jobs, for the time left.
     """
 
@@ -99,7 +99,7 @@ class Job:
     device: str
     workers: int = 0
     deadline: float | None = None
-    show: Destinations = NOWHERE
+    destinations: Destinations = NO_DESTINATIONS
     cost: float = 1.0
 
     @property
@@ -118,7 +118,7 @@ class Job:
         return self.updates * self.cost
 
     @property
-    def is_over(self) -> bool:
+    def deadline_passed(self) -> bool:
         """Whether the deadline has passed."""
         return self.deadline is not None and time.time() > self.deadline
 
@@ -146,12 +146,12 @@ def specs_of(
         settings: values by name; a list of values is varied.
         runs: the folder of all run folders.
         env_spec: the environment to evaluate in (EnvSpec JSON) instead of the datasets'.
-        label: the name in tables of the one variant that the settings are.
+        label: the name in tables, if the settings are one variant.
 
     Raises:
         OffbenchError: an unknown algorithm or setting, a bad value, or a label for several variants.
     """
-    algorithm, variants = use(algorithm), []
+    algorithm, variants = register(algorithm), []
     configs = configurations(load_algorithm(algorithm).Config, settings, algorithm)
     if label and len(configs) > 1:
         raise OffbenchError(

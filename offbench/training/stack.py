@@ -1,4 +1,4 @@
-"""A stack: runs that learn as one program. It trains, logs, and holds the policies and what a checkpoint keeps."""
+"""A stack: runs that train together as one program, with their policies, logs and checkpoints."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from offbench.algorithm.interface import Algorithm, PolicyParts, stack_configs
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
-from offbench.common.settings import shown
+from offbench.common.settings import short_repr
 from offbench.data.transitions import Transitions
 from offbench.rollouts.policy import Policy, check_networks
 from offbench.training.batches import CHUNK, Store, draw_chunk
@@ -23,7 +23,11 @@ class Stack:
     """The learning state of a stack of runs: everything but files and evaluations."""
 
     def __init__(
-        self, kind: type[Algorithm], specs: Sequence[RunSpec], datasets: Mapping[str, Transitions], device: str
+        self,
+        algorithm_class: type[Algorithm],
+        specs: Sequence[RunSpec],
+        datasets: Mapping[str, Transitions],
+        device: str,
     ) -> None:
         self.specs, self.device = list(specs), torch.device(device)
         self.data = [datasets[spec.dataset] for spec in specs]
@@ -33,10 +37,12 @@ class Stack:
         if len(dims) != 1:
             raise OffbenchError(f"datasets of one stack must have the same shapes, not {sorted(dims)}")
         observation_dim, action_dim = dims.pop()
-        self.algorithm = kind(config, observation_dim, action_dim, self.seeds, self.device)
+        self.algorithm = algorithm_class(config, observation_dim, action_dim, self.seeds, self.device)
         _check_policy(self.algorithm, observation_dim, action_dim)
         if not self.algorithm.learned:
-            raise OffbenchError(f"{kind.__name__} has no networks among its attributes: a checkpoint would be empty")
+            raise OffbenchError(
+                f"{algorithm_class.__name__} has no networks among its attributes: a checkpoint would be empty"
+            )
         self.batch_size: int = config.batch_size
         self.store = Store(specs, datasets, config.normalize, self.device, self.algorithm.uses_next_actions)
         self.noise_spec = self.algorithm.noise_spec(self.algorithm.config)
@@ -80,7 +86,7 @@ class Stack:
         )
 
     def origin(self, run: int) -> JsonObject:
-        """Return which run it is, for its policy file."""
+        """Return a run's algorithm, seed and dataset, for its policy file."""
         spec, data = self.specs[run], self.data[run]
         return {
             "algorithm": spec.algorithm,
@@ -90,7 +96,7 @@ class Stack:
         }
 
     def identity(self, run: int) -> JsonObject:
-        """Return which run it is and its settings, for its checkpoints."""
+        """Return a run's algorithm, seed, dataset and settings, for its checkpoints."""
         return self.origin(run) | settings_json(self.specs[run].config)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -102,11 +108,11 @@ class Stack:
         }
 
     def run_tensors(self, run: int) -> dict[str, Tensor]:
-        """Return what one run's checkpoint keeps: its slice of everything learned."""
+        """Return the tensors of one run's checkpoint: its slice of all learned tensors."""
         return slice_of(self.tensors(), run)
 
     def load(self, run: int, tensors: Mapping[str, Tensor], state: JsonObject) -> None:
-        """Put one run's checkpoint back. Raises OffbenchError if it does not fit, or is of another run."""
+        """Load one run's checkpoint. Raises OffbenchError if it does not fit, or is of another run."""
         check_origin(self.specs[run].folder, state, self.identity(run))
         for name, tensor in self.run_tensors(run).items():
             saved = tensors.get(name)
@@ -148,8 +154,8 @@ def check_origin(folder: Path, state: JsonObject, identity: JsonObject) -> None:
     """Raise OffbenchError if a checkpoint's state is of another run or settings than `identity` says."""
     recorded = state.get("origin", {})  # earlier versions wrote none, or not all of it
     for key, value in identity.items():
-        if (found := recorded.get(key, value)) != value:
+        if (old := recorded.get(key, value)) != value:
             raise OffbenchError(
-                f"the checkpoint in {folder} is of another run: its {key} is {shown(found)}, not {shown(value)}; put "
-                "the run's own back, or delete the run to repeat it"
+                f"the checkpoint in {folder} is of another run: its {key} is {short_repr(old)}, "
+                f"not {short_repr(value)}; put the run's own back, or delete the run to repeat it"
             )

@@ -1,4 +1,4 @@
-"""`train`: one algorithm on datasets; and how any runs are trained, those of a grid too.
+"""`train`: one algorithm on datasets. `Training`: any runs, also those of a grid.
 
 specs -> group -> jobs -> what is left of them (pending) -> run_jobs, or a cluster
 """
@@ -20,8 +20,8 @@ from offbench.envs.recipes import load_recipe
 from offbench.training.devices import Machine, pick_machine
 from offbench.training.grouping import Datasets, check_datasets, check_folders, group, load_datasets, pending
 from offbench.training.jobs import raise_first, run_jobs
-from offbench.training.loggers import NOWHERE, Destinations
-from offbench.training.registry import algorithm_names, current_settings, is_local, load_algorithm, use
+from offbench.training.loggers import NO_DESTINATIONS, Destinations
+from offbench.training.registry import algorithm_names, current_settings, is_local, load_algorithm, register
 from offbench.training.run import Run
 from offbench.training.source_code import changes, code_of
 from offbench.training.spec import Job, RunSpec, Times, settings_json, specs_of
@@ -94,9 +94,9 @@ def train(
             fetch(name)
     specs = [spec for name in names for variant in variants for spec in variant if spec.dataset == name]
     machine = pick_machine(device, workers, stack, precision)
-    show = Destinations(tensorboard, wandb)
-    show.check()
-    training = Training(specs, machine, command=command, show=show, fresh=fresh)
+    destinations = Destinations(tensorboard, wandb)
+    destinations.check()
+    training = Training(specs, machine, command=command, destinations=destinations, fresh=fresh)
     if training.finished:
         total = f"{len(specs)} run{'s' if len(specs) > 1 else ''}"
         print(f"already finished: {training.finished} of {total}", file=sys.stderr)
@@ -114,7 +114,7 @@ class Training:
 
     Args:
         command: what the user typed, for config.json.
-        show: live views of the training.
+        destinations: live views of the training.
         fresh: whether to delete what the runs' folders hold first.
 
     Raises:
@@ -127,15 +127,15 @@ class Training:
         machine: Machine,
         *,
         command: str = "",
-        show: Destinations = NOWHERE,
+        destinations: Destinations = NO_DESTINATIONS,
         fresh: bool = False,
     ) -> None:
         self.machine, self._command = machine, command
         self._datasets = load_datasets(specs)
         check_datasets(self._datasets)
-        self._groups = [replace(job, show=show) for job in group(specs, self._datasets, machine)]
+        self._groups = [replace(job, destinations=destinations) for job in group(specs, self._datasets, machine)]
         if fresh:
-            for job in self._groups:  # code that fails deletes nothing
+            for job in self._groups:  # if the code fails, nothing is deleted
                 _try_update(job.first, self._datasets)
             for spec in specs:
                 spec.run.clear()
@@ -178,7 +178,7 @@ class Training:
 
 
 def _try_update(spec: RunSpec, datasets: Datasets) -> None:
-    """Do the first update of a run on the CPU, and forget it."""
+    """Do the first update of a run on the CPU, to check that its code works; its result is discarded."""
     stack = Stack(load_algorithm(spec.algorithm), [spec], {spec.dataset: datasets[spec.dataset]}, "cpu")
     for _ in stack.train(1):
         pass
@@ -207,10 +207,10 @@ def restore(run: Run, algorithm: str | type | None = None) -> Stack:
         OffbenchError: no run, no checkpoint, its dataset is gone or changed, or its algorithm is another or unknown.
     """
     config = run.config()
-    if algorithm is not None and use(algorithm) != config.algorithm:
-        raise OffbenchError(f"{run.folder} is a run of {config.algorithm}, not of {use(algorithm)}")
+    if algorithm is not None and register(algorithm) != config.algorithm:
+        raise OffbenchError(f"{run.folder} is a run of {config.algorithm}, not of {register(algorithm)}")
     try:
-        kind = load_algorithm(config.algorithm)
+        algorithm_class = load_algorithm(config.algorithm)
     except OffbenchError as error:
         if config.algorithm in algorithm_names():
             raise
@@ -220,7 +220,7 @@ def restore(run: Run, algorithm: str | type | None = None) -> Stack:
         raise OffbenchError(
             f"{run.folder} was trained by other code of {config.algorithm}: {changed}; restore it, or train again"
         )
-    settings = build(kind.Config, recorded, f"{run.config_path}: settings")
+    settings = build(algorithm_class.Config, recorded, f"{run.config_path}: settings")
     data = transitions.load(config.dataset)
     if data.content != config.dataset_sha256:
         raise OffbenchError(f"{data.dataset_id} is no longer the dataset that {run.folder} was trained on")
@@ -231,7 +231,7 @@ def restore(run: Run, algorithm: str | type | None = None) -> Stack:
     times = config.steps, config.eval_every, config.eval_episodes
     check_origin(run.folder, state, settings_json(settings))  # before networks of that size are made
     spec = RunSpec(config.algorithm, settings, config.dataset, config.seed, *times, run.folder)
-    stack = Stack(kind, [spec], {config.dataset: data}, "cpu")
+    stack = Stack(algorithm_class, [spec], {config.dataset: data}, "cpu")
     stack.load(0, tensors, state)
     stack.step = int(state["step"])
     return stack

@@ -18,13 +18,13 @@ import numpy as np
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, check_ownership, disk_errors, read_bytes
-from offbench.common.interrupts import stops_noted
-from offbench.common.provenance import made_with
+from offbench.common.interrupts import collect_stop_signals
+from offbench.common.provenance import training_platform
 from offbench.common.scores import normalize
 from offbench.common.seeds import Purpose
 from offbench.common.terminal import inform
 from offbench.data.transitions import Transitions
-from offbench.rollouts.rollouts import Outcome, Rollouts, gathered
+from offbench.rollouts.rollouts import EpisodeStats, Rollouts, gathered
 from offbench.training.grouping import run_config
 from offbench.training.loggers import Loggers
 from offbench.training.registry import load_algorithm
@@ -33,8 +33,8 @@ from offbench.training.spec import Job
 from offbench.training.stack import Stack, slice_of
 
 LOG_EVERY = 1000  # updates per row of losses.csv
-QUICK = 1.0  # seconds; a checkpoint that takes longer is not written at every evaluation
-SHARE = 0.05  # of the time that slow checkpoints may take
+QUICK_SAVE = 1.0  # seconds; a checkpoint that takes longer is not written at every evaluation
+SLOW_SAVE_SHARE = 0.05  # largest share of the time spent on slow checkpoints
 
 STOPPED = "stopped with a checkpoint"  # the last note of a training that was interrupted
 
@@ -51,15 +51,15 @@ class Trainer:
     def __init__(self, job: Job, datasets: Mapping[str, Transitions]) -> None:
         self.job = job
         self.runs: list[Run] = [spec.run for spec in job.specs]
-        self.made = made_with(job.device, job.first.precision)
+        self.platform = training_platform(job.device, job.first.precision)
         self.stack = Stack(load_algorithm(job.first.algorithm), job.specs, datasets, job.device)
-        self.loggers = Loggers(self.runs, job.show)
+        self.loggers = Loggers(self.runs, job.destinations)
         self.evaluations: list[dict[int, list[tuple[float, int]]]] = [{} for _ in self.runs]
         self.losses: list[list[dict[str, float]]] = [[] for _ in self.runs]
-        self.pending: list[tuple[int, int, list[Future[list[Outcome]]]]] = []  # (run, step, episodes) under way
+        self.pending: list[tuple[int, int, list[Future[list[EpisodeStats]]]]] = []  # (run, step, episodes) under way
         self.rollouts: Rollouts | None = None
         self.note = ""
-        self.diverged: dict[int, str] = {}  # runs that have diverged, and what to tell the user
+        self.diverged: dict[int, str] = {}  # runs that have diverged, and the message for the user
         self.configs: list[bytes] = []  # each run's config.json
         self.stops: list[int] = []  # signals received: Ctrl-C and SIGTERM
         self._saved, self._save_seconds = time.monotonic(), 0.0  # when the last checkpoint was written, and how fast
@@ -75,7 +75,7 @@ class Trainer:
         """
         steps = self.job.first.steps
         with contextlib.ExitStack() as resources:
-            self.stops = resources.enter_context(stops_noted(second_at_once=True))
+            self.stops = resources.enter_context(collect_stop_signals(second_at_once=True))
             for run in self.runs:
                 resources.enter_context(run.locked())
             for run, spec, data in zip(self.runs, self.job.specs, self.stack.data, strict=True):
@@ -84,7 +84,7 @@ class Trainer:
             for run in self.runs:
                 if self.stack.step:
                     checkpoints.keep_newest(run.folder, self.stack.step)  # a killed process may have left one more
-                run.begin(self.stack.step, steps, self.made)
+                run.begin(self.stack.step, steps, self.platform)
             self.configs = [read_bytes(run.config_path) for run in self.runs]
             resources.enter_context(self.loggers)
             env_spec = self.stack.data[0].env_spec  # datasets of one stack are of one environment
@@ -114,7 +114,7 @@ class Trainer:
         if self.stops:
             return False
         for step in self.stack.train(stop):
-            late = self.job.is_over and step < stop
+            late = self.job.deadline_passed and step < stop
             if step % LOG_EVERY == 0 or step == stop:
                 for rows, row in zip(self.losses, self.stack.logged(), strict=True):
                     rows.append({"step": step, **row})
@@ -127,7 +127,7 @@ class Trainer:
 
     def _checkpoint_is_due(self) -> bool:
         """Return whether to write a checkpoint: always if that is quick, else for a small share of the time."""
-        return self._save_seconds < QUICK or time.monotonic() - self._saved > self._save_seconds / SHARE
+        return self._save_seconds < QUICK_SAVE or time.monotonic() - self._saved > self._save_seconds / SLOW_SAVE_SHARE
 
     def _mark_diverged(self) -> None:
         """Leave out the runs that hold NaN or infinity: their files stay as their last checkpoint left them."""
@@ -188,7 +188,7 @@ class Trainer:
                 self.stack.policy(i).save(run.policy_path)
                 state: JsonObject = {"step": step, "origin": self.stack.identity(i)}
                 unlogged = self.stack.program.unlogged(i)
-                if unlogged:  # stopped by the clock, between two rows of losses.csv
+                if unlogged:  # stopped between two rows of losses.csv
                     state["unlogged"] = unlogged
                 checkpoints.save_checkpoint(run.folder, step, slice_of(tensors, i), state)
                 checkpoints.keep_newest(run.folder, step)
@@ -225,7 +225,7 @@ class Trainer:
                 stream = (int(Purpose.EVALUATION), step)
                 policy = self.stack.policy(i)
                 self.pending.append(
-                    (i, step, self.rollouts.outcomes(policy, spec.seed, stream, spec.eval_episodes, True))
+                    (i, step, self.rollouts.start_evaluation(policy, spec.seed, stream, spec.eval_episodes, True))
                 )
 
     def _collect(self) -> None:

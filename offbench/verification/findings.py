@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 
 from offbench.common.text import counted
 
-AGAIN = "record or download the dataset again"
+RECORD_AGAIN = "record or download the dataset again"
 FAULTS: dict[str, tuple[str, str]] = {
     # code: (what it means, what to do)
-    "unreadable": ("the files cannot be read", AGAIN),
-    "empty": ("there is no transition", AGAIN),
-    "counts": ("the metadata's counts are not those of the data", AGAIN),
-    "shape": ("arrays do not fit the spaces or each other (T + 1 observations, T of all else)", AGAIN),
+    "unreadable": ("the files cannot be read", RECORD_AGAIN),
+    "empty": ("there is no transition", RECORD_AGAIN),
+    "counts": ("the metadata's counts are not those of the data", RECORD_AGAIN),
+    "shape": ("arrays do not fit the spaces or each other (T + 1 observations, T of all else)", RECORD_AGAIN),
     "dtype": ("numbers are of another type than their space", "convert them, or correct the space"),
     "not-finite": ("NaN or infinite numbers", "filter these episodes out of the dataset"),
     "outside-space": ("observations outside the observation space", "correct the space's bounds or the data"),
@@ -31,13 +31,13 @@ FAULTS: dict[str, tuple[str, str]] = {
     "too-long": ("an episode is longer than the environment's time limit", "cut it, or correct the env_spec"),
     "duplicate-episodes": ("the same episode twice", "keep one of them"),
     "repeated-seeds": ("several episodes were reset with the same seed", "give every episode its own"),
-    "wrong-seeds": ("seeds are not those of the recorded seed and part", AGAIN),
-    "content-hash": ("the arrays are not those that were recorded", AGAIN),
-    "metadata": ("what the metadata say of the recording is damaged", AGAIN),
-    "parts": ("the recorded parts do not end where episodes end", AGAIN),
+    "wrong-seeds": ("seeds are not those of the recorded seed and part", RECORD_AGAIN),
+    "content-hash": ("the arrays are not those that were recorded", RECORD_AGAIN),
+    "metadata": ("what the metadata say of the recording is damaged", RECORD_AGAIN),
+    "parts": ("the recorded parts do not end where episodes end", RECORD_AGAIN),
     "wrong-level": (
         "a part's mean return is not the one measured for its level: levels swapped, or other data",
-        AGAIN,
+        RECORD_AGAIN,
     ),
     "level-order": ("levels are out of order: random, medium, expert", "correct the metadata, or record again"),
     "other-spaces": ("the environment has other spaces than the dataset", "correct the env_spec"),
@@ -65,7 +65,7 @@ FAULTS: dict[str, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One kind of fault, and where in the dataset it occurs."""
+    """One type of fault, and where in the dataset it occurs."""
 
     code: str
     where: str
@@ -79,7 +79,7 @@ class Finding:
 
 
 class Findings:
-    """Collects faults, one finding for each code: a million bad rows are one line."""
+    """Collects faults, in one finding per code, however often it occurs."""
 
     SHOWN = 3
 
@@ -97,12 +97,12 @@ class Findings:
 
     def _finding(self, code: str) -> Finding:
         seen, (what, remedy) = self._seen[code], FAULTS[code]
-        places = list(dict.fromkeys(where for where, _ in seen))
-        where = ", ".join(places[: self.SHOWN])
-        if len(places) > self.SHOWN:
-            where += f" and {len(places) - self.SHOWN:,} more"
+        locations = list(dict.fromkeys(where for where, _ in seen))
+        where = ", ".join(locations[: self.SHOWN])
+        if len(locations) > self.SHOWN:
+            where += f" and {len(locations) - self.SHOWN:,} more"
         detail = next((detail for _, detail in seen if detail), "")
-        return Finding(code, where, f"{what} ({detail})" if detail else what, remedy, len(places))
+        return Finding(code, where, f"{what} ({detail})" if detail else what, remedy, len(locations))
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""What offbench recorded about a dataset, against the data: content hash, parts, seeds, levels and their returns."""
+"""Checks of offbench's metadata against the data: content hash, parts, seeds, levels and their returns."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ from offbench.common.seeds import Purpose
 from offbench.data.levels import LEVELS
 from offbench.data.minari_store import Provenance
 from offbench.verification.findings import Findings, Report
-from offbench.verification.scan import Survey
+from offbench.verification.scan import ScanResult
 
-SIGMAS = 6  # standard errors that a level's mean return may be off by,
-SLACK = 0.02  # and by this share of the references' distance: rungs are chosen for their measured return
+SIGMAS = 6  # standard errors that a level's mean return may deviate by,
+SLACK = 0.02  # in addition to this share of the references' distance: rungs are chosen by their measured return
 
 
-def check_claims(ours: Provenance, survey: Survey, limit: int | None, report: Report, findings: Findings) -> list[int]:
+def check_recorded_metadata(
+    ours: Provenance, scanned: ScanResult, limit: int | None, report: Report, findings: Findings
+) -> list[int]:
     """Check what offbench recorded about a dataset; return the last episode of each part."""
-    last = [len(survey.lengths) - 1] if survey.lengths else []
+    last = [len(scanned.lengths) - 1] if scanned.lengths else []
     if ours.content_sha256 is not None:
         report.checked.append("the content hash")
-        if ours.content_sha256 != survey.content.hexdigest():
+        if ours.content_sha256 != scanned.content.hexdigest():
             findings.add("content-hash", "metadata", f"recorded {ours.content_sha256[:12]}...")
     else:
         report.skipped.append("the content hash: none is recorded")
@@ -35,27 +37,27 @@ def check_claims(ours: Provenance, survey: Survey, limit: int | None, report: Re
     try:
         if ours.seed is None or ours.level is None:
             raise ValueError("no seed or no level is recorded")
-        cuts = _cuts(ours.parts, survey, findings)
-        if cuts is not None:
-            _levels(ours, ours.parts, findings)
-            for index, (part, (first, end)) in enumerate(zip(ours.parts, cuts, strict=True)):
-                _part(ours, part, index, range(first, end), survey, limit, findings)
-            last = [end - 1 for _, end in cuts]
+        ranges = _part_ranges(ours.parts, scanned, findings)
+        if ranges is not None:
+            _check_levels(ours, ours.parts, findings)
+            for index, (part, (first, end)) in enumerate(zip(ours.parts, ranges, strict=True)):
+                _check_part(ours, part, index, range(first, end), scanned, limit, findings)
+            last = [end - 1 for _, end in ranges]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, ZeroDivisionError, OverflowError) as error:
         findings.add("metadata", "metadata", f"{type(error).__name__}: {error}")
     report.checked.append("parts, seeds, level order and mean returns against the metadata")
     return last
 
 
-def _cuts(parts: Sequence[JsonObject], survey: Survey, findings: Findings) -> list[tuple[int, int]] | None:
-    """Return the episodes [first, end) of each part, or None if parts do not end where episodes do."""
-    ends = np.cumsum(survey.lengths)
+def _part_ranges(parts: Sequence[JsonObject], scanned: ScanResult, findings: Findings) -> list[tuple[int, int]] | None:
+    """Return the range of episodes (first, end) of each part, or None if a part does not end with an episode."""
+    ends = np.cumsum(scanned.lengths)
     wanted = np.cumsum([int(part["transitions"]) for part in parts])
-    places = np.searchsorted(ends, wanted)
-    if len(places) == 0 or places[-1] != len(ends) - 1 or (ends[places] != wanted).any():
+    last_episodes = np.searchsorted(ends, wanted)
+    if len(last_episodes) == 0 or last_episodes[-1] != len(ends) - 1 or (ends[last_episodes] != wanted).any():
         findings.add("parts", "metadata", f"parts end after {wanted.tolist()} transitions")
         return None
-    return list(zip([0, *(places[:-1] + 1)], places + 1, strict=True))
+    return list(zip([0, *(last_episodes[:-1] + 1)], last_episodes + 1, strict=True))
 
 
 def _references(ours: Provenance) -> tuple[float, float]:
@@ -64,8 +66,8 @@ def _references(ours: Provenance) -> tuple[float, float]:
     return float(references["random"]["return"]), float(references["expert"]["return"])
 
 
-def _levels(ours: Provenance, parts: Sequence[JsonObject], findings: Findings) -> None:
-    """Check that the levels' own numbers agree with each other."""
+def _check_levels(ours: Provenance, parts: Sequence[JsonObject], findings: Findings) -> None:
+    """Check that the recorded returns and fractions of the levels agree with each other."""
     low, high = _references(ours)
     returns = {part["source"]: float(part["return"]) for part in parts if "return" in part}
     order = [returns[name] for name in ("uniform", "medium", "expert") if name in returns]
@@ -80,33 +82,35 @@ def _levels(ours: Provenance, parts: Sequence[JsonObject], findings: Findings) -
             )
 
 
-def _part(
+def _check_part(
     ours: Provenance,
     part: JsonObject,
     index: int,
     chosen: range,
-    survey: Survey,
+    scanned: ScanResult,
     limit: int | None,
     out: Findings,
 ) -> None:
     """Check one part's seeds and mean return."""
     if part["source"] != "replay":
         for k, i in enumerate(chosen):
-            if survey.seeds[i] != seeds.integer(ours.seed or 0, Purpose.RESET, index, k):
+            if scanned.seeds[i] != seeds.integer(ours.seed or 0, Purpose.RESET, index, k):
                 out.add("wrong-seeds", f"episode {i}")
     if "return" not in part:
         return
-    whole = [survey.returns[i] for i in chosen if survey.ended[i][0] or limit is None or survey.lengths[i] == limit]
-    if not whole or not np.isfinite(whole).all():
+    complete = [
+        scanned.returns[i] for i in chosen if scanned.ended[i][0] or limit is None or scanned.lengths[i] == limit
+    ]
+    if not complete or not np.isfinite(complete).all():
         return
     count = int(part.get("episodes") or ours.references["random"]["episodes"])
     half = (float(part["interval"][1]) - float(part["interval"][0])) / 2 / 1.96
-    # the spread of single returns: as measured here and as behind the recorded interval, whichever is wider
-    spread = max(float(np.std(whole, ddof=1)) if len(whole) > 1 else 0.0, half * count**0.5)
+    # standard deviation of returns: the larger of the data's and the recorded interval's
+    spread = max(float(np.std(complete, ddof=1)) if len(complete) > 1 else 0.0, half * count**0.5)
     low, high = _references(ours)
     slack = SLACK * abs(high - low) if math.isfinite(high) else 0.0
-    allowed = SIGMAS * (spread**2 / len(whole) + half**2) ** 0.5 + slack
-    mean, recorded = float(np.mean(whole)), float(part["return"])
+    allowed = SIGMAS * (spread**2 / len(complete) + half**2) ** 0.5 + slack
+    mean, recorded = float(np.mean(complete)), float(part["return"])
     if not abs(mean - recorded) <= allowed:
-        detail = f"{mean:.1f} over {len(whole)} episodes, recorded {recorded:.1f}, plausible within {allowed:.1f}"
+        detail = f"{mean:.1f} over {len(complete)} episodes, recorded {recorded:.1f}, plausible within {allowed:.1f}"
         out.add("wrong-level", f"part {part['source']}", detail)

@@ -1,4 +1,4 @@
-"""One pass over every episode of a dataset: what can be seen without the environment, and what later checks need."""
+"""One pass over all episodes: checks that need no environment, and the data that later checks need."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import numpy as np
 from offbench.common.arrays import Array
 from offbench.common.progress import Progress
 from offbench.data.content_hash import ContentHash
-from offbench.data.minari_reader import Recorded, episodes_of, shape_faults
+from offbench.data.minari_reader import RecordedEpisode, episodes_of, shape_faults
 from offbench.verification.findings import Findings
 
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-PILE = 10  # equal actions at the outermost value that are no coincidence,
-PILE_SHARE = 0.001  # if they are at least this share of all
-INSIDE = 1e-4  # of the span: a bound nearer to the space's than this is the space's
+MIN_CLIPPED = 10  # fewest equal actions at a least or greatest value that count as clipped,
+MIN_CLIPPED_SHARE = 0.001  # and their least share of all actions
+INSIDE = 1e-4  # share of the space's range: a value nearer than this to the space's bound counts as the bound
 
 
 @dataclass
-class Survey:
+class ScanResult:
     """The results of one pass over the episodes."""
 
     content: ContentHash = field(default_factory=ContentHash)
@@ -32,7 +32,7 @@ class Survey:
     returns: list[float] = field(default_factory=list)
     seeds: list[int | None] = field(default_factory=list)
     ended: list[tuple[bool, bool]] = field(default_factory=list)
-    sound: list[bool] = field(default_factory=list)  # whether the arrays fit together and hold numbers
+    valid: list[bool] = field(default_factory=list)  # whether the arrays fit together and hold numbers
 
     @property
     def steps(self) -> int:
@@ -40,43 +40,48 @@ class Survey:
         return sum(self.lengths)
 
 
-def scan(dataset_id: str, data: MinariDataset, limit: int | None, findings: Findings) -> Survey:
-    """Look at every episode of a MinariDataset once; `limit` is the environment's time limit, if it has one."""
-    result, piles, twins = Survey(), _Piles(data.action_space), _Twins()
+def scan(dataset_id: str, data: MinariDataset, limit: int | None, findings: Findings) -> ScanResult:
+    """Check every episode of a MinariDataset once; `limit` is the environment's time limit, if it has one."""
+    result, clipping, duplicates = ScanResult(), _ClippingDetector(data.action_space), _DuplicateDetector()
     with Progress(int(data.total_steps), f"verifying {dataset_id}") as progress:
         for episode in episodes_of(data):
             where = f"episode {episode.index}"
             numeric = all(array.dtype.kind in "fiub" for array in episode.arrays)
-            sound = numeric and _check(episode, data.observation_space, data.action_space, limit, where, findings)
+            valid = numeric and _check(episode, data.observation_space, data.action_space, limit, where, findings)
             ends = tuple(bool(flags[-1]) if flags.size else False for flags in episode.arrays[3:])
             result.lengths.append(len(episode))
             result.seeds.append(episode.seed)
             result.ended.append((ends[0], ends[1]))
-            result.sound.append(sound)
+            result.valid.append(valid)
             result.returns.append(float(np.sum(episode.rewards, dtype=np.float64)) if numeric else float("nan"))
             if numeric:
                 fit = episode.terminations.shape == episode.truncations.shape and episode.terminations.size
                 flags = episode.arrays[3:] if fit else [[end] for end in ends]
                 result.content.add(episode.observations, episode.actions, episode.rewards, *flags)
-                twins.add(episode, findings)
+                duplicates.add(episode, findings)
             else:
                 findings.add("dtype", where, "not numbers")
-            if sound:
-                piles.add(episode.actions)
+            if valid:
+                clipping.add(episode.actions)
             progress.to(progress.done + len(episode))
-    piles.report(findings)
-    _seeds(result.seeds, findings)
+    clipping.report(findings)
+    _check_seeds(result.seeds, findings)
     return result
 
 
 def _check(
-    e: Recorded, observations: gym.spaces.Box, actions: gym.spaces.Box, limit: int | None, where: str, out: Findings
+    e: RecordedEpisode,
+    observations: gym.spaces.Box,
+    actions: gym.spaces.Box,
+    limit: int | None,
+    where: str,
+    out: Findings,
 ) -> bool:
-    """Check one episode by itself; return whether its arrays fit together, so that it can be played again."""
-    sound = True
+    """Check one episode by itself; return whether its arrays fit together, so that it can be replayed."""
+    valid = True
     for fault in shape_faults(e, observations, actions):
         out.add("shape", where, fault)
-        sound = False
+        valid = False
     for name, space in (("observations", observations), ("actions", actions)):
         if getattr(e, name).dtype != space.dtype:
             out.add("dtype", where, f"{name} are {getattr(e, name).dtype}, their space is {space.dtype}")
@@ -87,14 +92,14 @@ def _check(
         array = getattr(e, name)
         if not np.issubdtype(array.dtype, np.number) or not np.isfinite(array).all():
             out.add("not-finite", where, name)
-            sound = False
-    if sound:
+            valid = False
+    if valid:
         _check_ends(e, limit, where, out)
         _check_bounds(e, observations, actions, where, out)
-    return sound
+    return valid
 
 
-def _check_ends(e: Recorded, limit: int | None, where: str, out: Findings) -> None:
+def _check_ends(e: RecordedEpisode, limit: int | None, where: str, out: Findings) -> None:
     ends = e.terminations.astype(bool) | e.truncations.astype(bool)
     if ends[:-1].any():
         out.add("early-end", where, f"step {int(np.flatnonzero(ends)[0])} of {len(e)}")
@@ -105,7 +110,7 @@ def _check_ends(e: Recorded, limit: int | None, where: str, out: Findings) -> No
 
 
 def _check_bounds(
-    e: Recorded, observations: gym.spaces.Box, actions: gym.spaces.Box, where: str, out: Findings
+    e: RecordedEpisode, observations: gym.spaces.Box, actions: gym.spaces.Box, where: str, out: Findings
 ) -> None:
     if ((e.observations < observations.low) | (e.observations > observations.high)).any():
         out.add("outside-space", where)
@@ -114,8 +119,8 @@ def _check_bounds(
         out.add("action-bounds", where, f"by up to {over.max():g}")
 
 
-class _Piles:
-    """Finds actions that pile up at a bound of their own, inside the space's: they were clipped after the fact."""
+class _ClippingDetector:
+    """Finds actions clipped after execution: many equal ones at a least or greatest value inside the bounds."""
 
     def __init__(self, space: gym.spaces.Box) -> None:
         self.space, self.total = space, 0
@@ -133,8 +138,8 @@ class _Piles:
         low, high = self.space.low.astype(np.float64), self.space.high.astype(np.float64)
         inside = (self.ends[0] > low + INSIDE * (high - low), self.ends[1] < high - INSIDE * (high - low))
         for side, name in enumerate(("at least", "at most")):
-            piled = inside[side] & (self.counts[side] >= max(PILE, PILE_SHARE * self.total))
-            for i in np.argwhere(piled):
+            clipped = inside[side] & (self.counts[side] >= max(MIN_CLIPPED, MIN_CLIPPED_SHARE * self.total))
+            for i in np.argwhere(clipped):
                 index = tuple(i)
                 # one constant action is no clipping
                 if self.counts[side][index] < self.total:
@@ -142,13 +147,13 @@ class _Piles:
                     findings.add("clipped-actions", f"action {'.'.join(map(str, index))}", detail)
 
 
-class _Twins:
-    """Finds episodes that are there twice."""
+class _DuplicateDetector:
+    """Finds episodes that occur twice."""
 
     def __init__(self) -> None:
         self.first_index: dict[bytes, int] = {}
 
-    def add(self, e: Recorded, findings: Findings) -> None:
+    def add(self, e: RecordedEpisode, findings: Findings) -> None:
         digest = hashlib.blake2b(digest_size=16)
         for array in (e.observations, e.actions, e.rewards):
             digest.update(np.ascontiguousarray(array).data)
@@ -157,7 +162,7 @@ class _Twins:
             findings.add("duplicate-episodes", f"episodes {first} and {e.index}")
 
 
-def _seeds(seeds: list[int | None], findings: Findings) -> None:
+def _check_seeds(seeds: list[int | None], findings: Findings) -> None:
     first_episode: dict[int, int] = {}
     for i, seed in enumerate(seeds):
         if seed is not None and first_episode.setdefault(seed, i) != i:

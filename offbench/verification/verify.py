@@ -1,8 +1,8 @@
-"""`verify`: is a dataset what it says? Its episodes, its metadata against them, and a sample of them played again.
+"""`verify`: check a dataset's episodes, compare its metadata with them, and replay a sample in the environment.
 
 scan          one pass over every episode: shapes, ends, numbers, bounds, duplicates, seeds, content hash
 metadata      parts, levels and their returns, as offbench recorded them
-resimulate    a sample of episodes played again in the environment
+resimulate    a sample of episodes replayed in the environment
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from offbench.common.seeds import Purpose
 from offbench.common.text import counted
 from offbench.data import minari_store
 from offbench.data.file_stamps import unchanged
-from offbench.data.minari_reader import Recorded, episodes_of, open_minari, reading
+from offbench.data.minari_reader import RecordedEpisode, episodes_of, open_minari, reading
 from offbench.data.recorded_env import margins_matter, recorded_margin, recorded_mujoco
 from offbench.envs.environments import box, same_bounds, untrusted_env
-from offbench.envs.margin_rule import ADDED, EARLIER, SINCE, with_margin
+from offbench.envs.margin_rule import ADDED, EARLIER, MUJOCO_VERSIONS, with_margin
 from offbench.rollouts.rollouts import Rollouts, result
 from offbench.verification.findings import Findings, Report
-from offbench.verification.metadata import check_claims
-from offbench.verification.resimulate import Verdict, check
-from offbench.verification.scan import Survey, scan
+from offbench.verification.metadata import check_recorded_metadata
+from offbench.verification.resimulate import ReplayResult, replay_episode
+from offbench.verification.scan import ScanResult, scan
 
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-EPISODES = 300  # played again by default: half a minute for a million transitions
-SOME = 10  # of them, about, that are played under both rules for contact margins if the metadata name none
+EPISODES = 300  # replayed by default: half a minute for a million transitions
+RULE_EPISODES = 10  # about how many are replayed under both rules for contact margins if the metadata name none
 REQUIREMENT = {EARLIER: "mujoco<3.5", ADDED: "mujoco>=3.5"}
-SEVERAL = 3  # terminations at the time limit, and none elsewhere, are no coincidence
-FEW = 20_000  # steps to play again that are not worth worker processes
+MIN_TERMINATIONS = 3  # fewest terminations that are a fault if all are at the time limit
+FEW_STEPS = 20_000  # up to this many steps are replayed without worker processes
 
 
 def verify(dataset_id: str, *, episodes: int | None = None, workers: int | None = None) -> Report:
@@ -47,11 +47,11 @@ def verify(dataset_id: str, *, episodes: int | None = None, workers: int | None 
 
     Args:
         dataset_id: its id.
-        episodes: how many are played again in the environment, where that is possible (default: 300).
+        episodes: how many are replayed in the environment, where that is possible (default: 300).
         workers: processes for it (default: one per core).
 
     Returns:
-        The report; `report.ok` is False if something is off. Damaged data are findings, not errors.
+        The report; `report.ok` is False if it has findings. Damaged data are findings, not errors.
 
     Raises:
         OffbenchError: no such dataset, spaces other than flat Boxes, or it was replaced meanwhile.
@@ -74,21 +74,21 @@ def _verify(dataset_id: str, episodes: int | None, workers: int | None) -> Repor
         box(data.action_space, f"{dataset_id}: actions")
         limit = _limit(metadata.get("env_spec"))
         with reading(dataset_id):
-            survey = scan(dataset_id, data, limit, findings)
+            scanned = scan(dataset_id, data, limit, findings)
     except DamagedError as error:
         text = str(error)
         findings.add(code, dataset_id, text.rpartition("; ")[0] or text)  # the finding has a remedy of its own
         report.findings = findings.all()
         return report
-    report.transitions, report.episodes = survey.steps, len(survey.lengths)
+    report.transitions, report.episodes = scanned.steps, len(scanned.lengths)
     report.checked.append("every episode: shapes, types, ends, finite numbers, bounds, duplicates, seeds")
-    if not survey.steps:
+    if not scanned.steps:
         findings.add("empty", dataset_id)
-    _counts(metadata, dataset_id, survey, findings)
-    _terminations(survey, limit, findings)
-    last = check_claims(minari_store.provenance(metadata), survey, limit, report, findings)
-    chosen = _choose(survey, limit, last, episodes)
-    _play(data, chosen, survey, metadata, workers, report, findings)
+    _check_counts(metadata, dataset_id, scanned, findings)
+    _check_terminations(scanned, limit, findings)
+    last = check_recorded_metadata(minari_store.provenance(metadata), scanned, limit, report, findings)
+    chosen = _choose_episodes(scanned, limit, last, episodes)
+    _replay(data, chosen, scanned, metadata, workers, report, findings)
     report.findings = findings.all()
     return report
 
@@ -102,32 +102,32 @@ def _limit(spec: str | None) -> int | None:
     return limit if isinstance(limit, int) and limit > 0 else None
 
 
-def _counts(metadata: JsonObject, dataset_id: str, survey: Survey, findings: Findings) -> None:
-    for key, count in (("total_steps", survey.steps), ("total_episodes", len(survey.lengths))):
+def _check_counts(metadata: JsonObject, dataset_id: str, scanned: ScanResult, findings: Findings) -> None:
+    for key, count in (("total_steps", scanned.steps), ("total_episodes", len(scanned.lengths))):
         if metadata.get(key) != count:
             findings.add("counts", "metadata", f"{key} is {metadata.get(key)}, the data have {count}")
     if metadata.get("dataset_id") != dataset_id:
         findings.add("metadata", "metadata", f"it calls itself {metadata.get('dataset_id')!r}")
 
 
-def _terminations(survey: Survey, limit: int | None, findings: Findings) -> None:
-    """Report an environment's clock marked as termination: every termination lies exactly at the time limit."""
-    lengths = [length for length, (terminated, _) in zip(survey.lengths, survey.ended, strict=True) if terminated]
-    if limit is not None and len(lengths) >= SEVERAL and set(lengths) == {limit}:
+def _check_terminations(scanned: ScanResult, limit: int | None, findings: Findings) -> None:
+    """Report time limits marked as terminations: every termination is exactly at the time limit."""
+    lengths = [length for length, (terminated, _) in zip(scanned.lengths, scanned.ended, strict=True) if terminated]
+    if limit is not None and len(lengths) >= MIN_TERMINATIONS and set(lengths) == {limit}:
         detail = f"all {len(lengths):,} terminations lie exactly at the time limit of {limit:,} steps"
         findings.add("timeouts-as-terminations", "ends", detail)
 
 
-def _play(
+def _replay(
     data: MinariDataset,
     chosen: Sequence[int],
-    survey: Survey,
+    scanned: ScanResult,
     metadata: JsonObject,
     workers: int,
     report: Report,
     findings: Findings,
 ) -> None:
-    """Play the chosen episodes again, by the strictest means that each allows."""
+    """Replay the chosen episodes, each by the strictest method that it allows."""
     spec = metadata.get("env_spec")
     if not spec:
         report.skipped.append("playing episodes again: the dataset names no environment")
@@ -139,27 +139,32 @@ def _play(
     if made is not None and not exact:
         report.warnings.append(f"recorded with mujoco {made}, installed is {here}: compared within a tolerance")
     last_unknown = minari_store.provenance(metadata).final_observations == "repeated"
-    steps = sum(survey.lengths[i] for i in chosen)
+    steps = sum(scanned.lengths[i] for i in chosen)
     names = [int(data.episode_indices[i]) for i in chosen]
-    with Rollouts(spec, workers if workers > 1 and steps > FEW else 0) as rollouts:
+    with Rollouts(spec, workers if workers > 1 and steps > FEW_STEPS else 0) as rollouts:
 
-        def replay(spec: str, episodes: Iterable[Recorded]) -> list[Verdict]:
-            jobs = [rollouts.call(check, spec, e, exact, last_unknown and bool(e.terminations[-1])) for e in episodes]
+        def replay(spec: str, episodes: Iterable[RecordedEpisode]) -> list[ReplayResult]:
+            jobs = [
+                rollouts.call(replay_episode, spec, e, exact, last_unknown and bool(e.terminations[-1]))
+                for e in episodes
+            ]
             return [result(job) for job in jobs]
 
         rule = recorded_margin(metadata)
         if rule is None and margins_matter(spec):
-            some = list(episodes_of(data, names[:: max(1, len(names) // SOME)]))
-            off = {rule: sum(bool(v.faults) for v in replay(with_margin(spec, rule), some)) for rule in SINCE}
+            some = list(episodes_of(data, names[:: max(1, len(names) // RULE_EPISODES)]))
+            off = {
+                rule: sum(bool(v.faults) for v in replay(with_margin(spec, rule), some)) for rule in MUJOCO_VERSIONS
+            }
             rule = min(off, key=off.__getitem__)
             if off[EARLIER] != off[ADDED]:
                 report.warnings.append(
-                    f"recorded with the contact margins of MuJoCo {SINCE[rule]}, as {counted(len(some), 'episode')} "
-                    f"show, and its metadata do not tell: add {REQUIREMENT[rule]!r} to its requirements, so that "
-                    "policies are evaluated with them"
+                    f"recorded with the contact margins of MuJoCo {MUJOCO_VERSIONS[rule]}, as "
+                    f"{counted(len(some), 'episode')} show, and its metadata do not tell: add {REQUIREMENT[rule]!r} "
+                    "to its requirements, so that policies are evaluated with them"
                 )
-        verdicts = replay(with_margin(spec, rule or EARLIER), episodes_of(data, names))
-    _report(verdicts, made if exact else None, report, findings)
+        replays = replay(with_margin(spec, rule or EARLIER), episodes_of(data, names))
+    _add_replays(replays, made if exact else None, report, findings)
 
 
 def _same_spaces(spec: str, data: MinariDataset, report: Report, findings: Findings) -> bool:
@@ -178,35 +183,35 @@ def _same_spaces(spec: str, data: MinariDataset, report: Report, findings: Findi
     return same
 
 
-def _choose(survey: Survey, limit: int | None, last: Sequence[int], episodes: int) -> list[int]:
-    """Return the episodes to play again: a random sample, the last of each part, and those that end at the limit."""
-    sound = [i for i, good in enumerate(survey.sound) if good]
-    if not sound or episodes < 1:
+def _choose_episodes(scanned: ScanResult, limit: int | None, last: Sequence[int], episodes: int) -> list[int]:
+    """Return the episodes to replay: a random sample, the last of each part, and those that end at the limit."""
+    valid = [i for i, good in enumerate(scanned.valid) if good]
+    if not valid or episodes < 1:
         return []
     rng = seeds.generator(0, Purpose.SAMPLE)
-    sample = rng.choice(sound, min(episodes, len(sound)), replace=False).tolist()
-    suspects = [i for i in sound if survey.lengths[i] == limit and survey.ended[i][0]][:episodes]
-    return sorted({*sample, *suspects, *(i for i in last if survey.sound[i])})
+    sample = rng.choice(valid, min(episodes, len(valid)), replace=False).tolist()
+    suspects = [i for i in valid if scanned.lengths[i] == limit and scanned.ended[i][0]][:episodes]
+    return sorted({*sample, *suspects, *(i for i in last if scanned.valid[i])})
 
 
-def _report(verdicts: Sequence[Verdict], mujoco: str | None, report: Report, findings: Findings) -> None:
+def _add_replays(replays: Sequence[ReplayResult], mujoco: str | None, report: Report, findings: Findings) -> None:
     ways = {
         "seed": f"from their seeds, {f'bit for bit (mujoco {mujoco})' if mujoco else 'within a tolerance'}",
         "step": "one step at a time from recorded states",
     }
-    for how, words in ways.items():
-        played = [verdict for verdict in verdicts if verdict.how == how]
+    for how, method in ways.items():
+        played = [replay for replay in replays if replay.how == how]
         if played:
-            steps = sum(verdict.steps for verdict in played)
-            report.checked.append(f"{counted(len(played), 'episode')} played again {words}: {counted(steps, 'step')}")
-    open_ends = sum(verdict.how != "none" and not verdict.end for verdict in verdicts)
+            steps = sum(replay.steps for replay in played)
+            report.checked.append(f"{counted(len(played), 'episode')} played again {method}: {counted(steps, 'step')}")
+    open_ends = sum(replay.how != "none" and not replay.end for replay in replays)
     if open_ends:
-        words = f"the {'ends' if open_ends > 1 else 'end'} of {counted(open_ends, 'episode')}"
-        report.skipped.append(f"{words}: the last step cannot be played from its observation")
-    left = sum(verdict.how == "none" for verdict in verdicts)
+        text = f"the {'ends' if open_ends > 1 else 'end'} of {counted(open_ends, 'episode')}"
+        report.skipped.append(f"{text}: the last step cannot be played from its observation")
+    left = sum(replay.how == "none" for replay in replays)
     if left:
-        words = f"playing {counted(left, 'episode')} again"
-        report.skipped.append(f"{words}: no seed, and no state to be set from observations")
-    for verdict in verdicts:
-        for code, detail in verdict.faults:
-            findings.add(code, f"episode {verdict.index}", detail)
+        text = f"playing {counted(left, 'episode')} again"
+        report.skipped.append(f"{text}: no seed, and no state to be set from observations")
+    for replay in replays:
+        for code, detail in replay.faults:
+            findings.add(code, f"episode {replay.index}", detail)

@@ -17,7 +17,7 @@ from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common.errors import OffbenchError
 from offbench.data.levels import Part, parse_level, parse_mix, shares
 from offbench.envs.recipes import load_recipe
-from offbench.rollouts.rollouts import Outcome
+from offbench.rollouts.rollouts import EpisodeStats
 
 
 def evaluator(
@@ -199,12 +199,12 @@ def test_a_build_that_was_interrupted_measures_nothing_again(tiny: tuple[str, st
 
         calls = 0
 
-        def outcomes(self, *_: Any) -> list[Future[list[Outcome]]]:
+        def start_evaluation(self, *_: Any) -> list[Future[list[EpisodeStats]]]:
             self.calls += 1
             if self.calls > 2:
                 raise PlayedError
-            future: Future[list[Outcome]] = Future()
-            future.set_result([Outcome(30.0 + i, 9) for i in range(8)])
+            future: Future[list[EpisodeStats]] = Future()
+            future.set_result([EpisodeStats(30.0 + i, 9) for i in range(8)])
             return [future]
 
     def evaluator_of(folder: TrainingFolder) -> RungEvaluator:

@@ -82,7 +82,7 @@ def test_a_terminal_shows_the_same(clock: Clock, monkeypatch: pytest.MonkeyPatch
     with progress.Progress(1000, "recording") as bar:
         clock.now = 10.0
         bar.to(100, "score 3")
-        bar.say("a line above")
+        bar.print_line("a line above")
     assert "recording" in screen.getvalue()
     assert "10%" in screen.getvalue()
     assert "100/1,000, 10 steps/s, 1 min 30 s left" in screen.getvalue()

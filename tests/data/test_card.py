@@ -13,7 +13,7 @@ from offbench.agents.ladder import read_ladder
 from offbench.common.errors import OffbenchError
 from offbench.common.files import read_json
 from offbench.common.provenance import versions
-from offbench.data.card import card, compare
+from offbench.data.card import card, compare_with_card
 from offbench.data.levels import LEVELS
 from offbench.envs.recipes import load_recipe, names
 
@@ -90,21 +90,25 @@ def test_a_card_is_made_from_the_five_levels(home: Path, capfd: pytest.CaptureFi
 
 def test_another_content_is_said_with_the_likely_reason(home: Path) -> None:
     recipe = replace(load_recipe("hopper"), folder=home)
-    assert compare(recipe, "medium", "abc") is None  # no card
+    assert compare_with_card(recipe, "medium", "abc") is None  # no card
     here = versions()["mujoco"]
     contents = {here: "abc", "3.4.9": "abe"}
     known = {"versions": {"numpy": versions()["numpy"]}, "levels": {"medium": {"content_sha256": contents}}}
     (home / "card.json").write_text(json.dumps(known))
-    assert compare(recipe, "60percent", "abc") is None  # no such level on it
-    assert compare(recipe, "medium", "abc") == "content equal to the dataset card's, bit for bit"
+    assert compare_with_card(recipe, "60percent", "abc") is None  # no such level on it
+    assert compare_with_card(recipe, "medium", "abc") == "content equal to the dataset card's, bit for bit"
     assert (
-        compare(recipe, "medium", "abe") == "content equal to the dataset card's, bit for bit"
+        compare_with_card(recipe, "medium", "abe") == "content equal to the dataset card's, bit for bit"
     )  # the earlier MuJoCo's
-    assert "although the versions are the same" in str(compare(recipe, "medium", "abd"))
+    assert "although the versions are the same" in str(compare_with_card(recipe, "medium", "abd"))
     (home / "card.json").write_text(json.dumps(known | {"levels": {"medium": {"content_sha256": {"3.4.9": "abe"}}}}))
-    assert "differs from the dataset card's, which was made with mujoco 3.4.9" in str(compare(recipe, "medium", "abd"))
+    assert "differs from the dataset card's, which was made with mujoco 3.4.9" in str(
+        compare_with_card(recipe, "medium", "abd")
+    )
     (home / "card.json").write_text(json.dumps(known | {"versions": {"numpy": "0.1"}}))
-    assert "differs from the dataset card's, which was made with numpy 0.1" in str(compare(recipe, "medium", "abd"))
+    assert "differs from the dataset card's, which was made with numpy 0.1" in str(
+        compare_with_card(recipe, "medium", "abd")
+    )
 
 
 def test_an_environment_without_a_ladder_has_no_card() -> None:

@@ -14,13 +14,13 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.errors import OffbenchError
-from offbench.data.minari_reader import Recorded
+from offbench.data.minari_reader import RecordedEpisode
 from offbench.envs import environments
 from offbench.envs.environments import action_box, box, checked_spec, env_spec, make_env, untrusted_env
 from offbench.envs.recipes import d4rl_reference
 from offbench.rollouts.policy import uniform
-from offbench.rollouts.rollouts import Named, Rollouts, gathered, number
-from offbench.verification.resimulate import check
+from offbench.rollouts.rollouts import ErrorReporting, Rollouts, gathered, scalar_reward
+from offbench.verification.resimulate import replay_episode
 
 PENDULUM = (np.full(1, -3, np.float32), np.full(1, 3, np.float32))
 HOPPER = (-20.272305, 3234.3)  # D4RL's infos.py
@@ -51,7 +51,7 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> str:
     module = types.ModuleType("steps_module")
     module.Steps = Steps  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "steps_module", module)
-    environments._endless.clear()
+    environments._warned_no_time_limit.clear()
     gym.register("Steps-v0", "steps_module:Steps")
     try:
         yield env_spec("Steps-v0")  # type: ignore[misc]
@@ -62,7 +62,7 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> str:
 def play(spec: str) -> list[float]:
     policy = uniform(np.full(1, -1, np.float32), np.full(1, 1, np.float32), 3, "Steps-v0")
     with Rollouts(spec) as rollouts:
-        return [outcome.ret for outcome in gathered(rollouts.outcomes(policy, 0, (), 2, False))]
+        return [outcome.ret for outcome in gathered(rollouts.start_evaluation(policy, 0, (), 2, False))]
 
 
 @pytest.mark.parametrize(
@@ -189,13 +189,13 @@ def test_an_environment_that_fails_is_named(steps: str, monkeypatch: pytest.Monk
     with pytest.raises(OffbenchError, match=r"Steps-v0 failed: .*shape \(2,\)"):
         play(steps)
     with pytest.raises(ValueError, match="shape"):
-        number(np.ones((2, 2)))
+        scalar_reward(np.ones((2, 2)))
     monkeypatch.setattr(Steps, "fails", True)
     with pytest.raises(OffbenchError, match=r"Steps-v0 failed: KeyError: 'torque'"):
         play(steps)
-    recorded = Recorded(0, 0, np.zeros((2, 3), np.float32), *(np.zeros((1, 1)) for _ in range(4)))
+    recorded = RecordedEpisode(0, 0, np.zeros((2, 3), np.float32), *(np.zeros((1, 1)) for _ in range(4)))
     with pytest.raises(OffbenchError, match=r"Steps-v0 failed: KeyError: 'torque'"):
-        check(steps, recorded, True, False)
+        replay_episode(steps, recorded, True, False)
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_numbers_that_are_none_are_neither_recorded_nor_learned_from(
         monkeypatch.setattr(Steps, name, value)
     with pytest.raises(OffbenchError, match=f"Steps-v0 failed: .*{what}"):
         play(steps)
-    env = Named(make_env(steps))  # what SAC learns in
+    env = ErrorReporting(make_env(steps))  # what SAC learns in
     env.reset(seed=0)
     with pytest.raises(OffbenchError, match=f"Steps-v0 failed: .*{what}"):
         env.step(np.zeros(1, np.float32))
@@ -224,15 +224,17 @@ def test_numbers_that_are_none_are_neither_recorded_nor_learned_from(
 def test_an_environment_without_a_time_limit_is_named_and_does_not_run_for_ever(
     steps: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    environments._endless.clear()
+    environments._warned_no_time_limit.clear()
     env_spec("Steps-v0")
     assert "Steps-v0 has no time limit (max_episode_steps)" in capsys.readouterr().err
     assert play(steps) == [1.0, 1.0]  # it ends by itself
-    monkeypatch.setattr("offbench.rollouts.rollouts.LONGEST", 200)
+    monkeypatch.setattr("offbench.rollouts.rollouts.LONGEST_EPISODE", 200)
     monkeypatch.setattr(Steps, "ends", False)
     with pytest.raises(OffbenchError, match=r"not ended within 200 steps.*max_episode_steps"):
         play(steps)
-    limited = json.loads(steps) | {"max_episode_steps": 300}  # beyond LONGEST: the environment's own limit counts
+    limited = json.loads(steps) | {
+        "max_episode_steps": 300
+    }  # beyond LONGEST_EPISODE: the environment's own limit counts
     assert play(json.dumps(limited)) == [300.0, 300.0]
 
 

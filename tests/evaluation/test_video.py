@@ -82,11 +82,11 @@ def test_a_backend_that_cannot_draw_is_passed_over(monkeypatch: pytest.MonkeyPat
 
 def test_the_users_choice_of_backend_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "glfw")
-    with renderer.drawing_with("egl"):
+    with renderer.rendering_with("egl"):
         assert os.environ["MUJOCO_GL"] == "egl"
     assert os.environ["MUJOCO_GL"] == "glfw"
     monkeypatch.delenv("MUJOCO_GL")
-    with renderer.drawing_with("osmesa"):
+    with renderer.rendering_with("osmesa"):
         pass
     assert "MUJOCO_GL" not in os.environ
 

@@ -23,7 +23,7 @@ import offbench
 from offbench.agents.sb3_zip import read_sb3_zip
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
-from offbench.common.files import home_folder, output_file, regular
+from offbench.common.files import home_folder, open_regular, output_file
 from offbench.data import minari_store
 from offbench.envs.environments import box, make_env, untrusted_env
 from tests.faults.test_integrity import refusal
@@ -136,7 +136,7 @@ def test_a_socket_is_no_file(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as server:
         server.bind("s")  # below the current folder: its path may have 100 bytes
         with pytest.raises(OSError, match="is not a regular file"):
-            regular("s")
+            open_regular("s")
 
 
 def test_links_in_a_circle_are_listed_once(medium: str, home: Path) -> None:

@@ -219,7 +219,9 @@ def test_a_dataset_replaced_while_it_is_exported_or_verified(
 
 def test_a_dataset_deleted_while_it_is_verified(recorded: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After its arrays are read: Minari itself notices, with an error of its own."""
-    monkeypatch.setattr("offbench.verification.verify._counts", lambda *_: shutil.rmtree(home / "minari" / recorded))
+    monkeypatch.setattr(
+        "offbench.verification.verify._check_counts", lambda *_: shutil.rmtree(home / "minari" / recorded)
+    )
     with pytest.raises(offbench.OffbenchError, match="was replaced while it was read"):
         offbench.verify(recorded)
 

@@ -23,7 +23,7 @@ from offbench.common.files import sha256_of
 from offbench.common.seeds import Purpose, generator
 from offbench.evaluation.similarity import similarity
 from offbench.rollouts.policy import MOST_VALUES, Policy
-from offbench.rollouts.rollouts import NOISE_BLOCK, Task, _Lane
+from offbench.rollouts.rollouts import NOISE_BLOCK, Task, _RunningEpisode
 from offbench.training.run import Run
 from tests.made_runs import made_run
 
@@ -154,7 +154,7 @@ def best_by_q(samples: int, width: int) -> Policy:
 def test_noise_is_drawn_in_blocks_that_change_no_number(samples: int) -> None:
     policy, task = best_by_q(samples, 8), Task("", b"", 0, (), (0,), False)
     with gym.make(policy.env_id) as env:
-        lane = _Lane(env, policy, task, 0)
+        lane = _RunningEpisode(env, policy, task, 0)
         rows = []
         for _ in range(30):
             rows.append(lane.next_noise())

@@ -58,7 +58,7 @@ def test_leftovers_of_a_recording_of_any_kind_are_removed(
 def test_half_of_a_replaced_dataset_is_not_put_back(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Killed while it deletes the dataset that it has replaced."""
     path = minari_store.path_of(medium)
-    shutil.copytree(path, minari_store.beside(path, "old"))
+    shutil.copytree(path, minari_store.hidden_path(path, "old"))
 
     def killed(folder: Path) -> None:
         for file in [file for file in folder.rglob("*.hdf5") if file.is_file()]:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 import offbench
-from offbench.cli.main import Terminated, _terminable, main
+from offbench.cli.main import Terminated, _stop_on_signals, main
 from offbench.common import hdf5_file
 from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import exclusive_lock, write_bytes
@@ -182,7 +182,7 @@ def test_a_stop_within_a_write_of_hdf5_is_a_stop(
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stop_between_writes_of_hdf5_is_not_delayed(number: int, tmp_path: Path, ctrl_c: None) -> None:
     """The next episode may take long, or never come."""
-    with _terminable(), hdf5_file.safe_file(tmp_path / "x") as file:
+    with _stop_on_signals(), hdf5_file.safe_file(tmp_path / "x") as file:
         file.write(b"1")
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(number)
@@ -193,7 +193,7 @@ def test_a_stop_within_a_finalizer_is_not_lost() -> None:
         def __del__(self) -> None:
             signal.raise_signal(signal.SIGTERM)
 
-    with _terminable():
+    with _stop_on_signals():
         thing = Finalized()
         del thing  # Python prints what a finalizer raises, and goes on
         with pytest.raises(Terminated):

@@ -129,7 +129,7 @@ def test_a_failing_disk_does_not_send_a_run_back_to_an_older_checkpoint(
     def fail(path: Path) -> int:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(checkpoints, "regular", fail)
+    monkeypatch.setattr(checkpoints, "open_regular", fail)
     with pytest.raises(OffbenchError, match=r"cannot read .*checkpoint-000000020.*check the disk"):
         checkpoints.load_newest(tmp_path)
     monkeypatch.undo()

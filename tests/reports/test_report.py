@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import offbench
-from offbench.analysis.methods import OURS, Method
+from offbench.analysis.methods import EXTENSION_SETTINGS, Method
 from offbench.analysis.results import Task, read_results
 from offbench.cli.main import main
 from offbench.common.files import write_json
@@ -147,7 +147,7 @@ def test_the_published_numbers_are_found_by_method() -> None:
     assert Method("bdb", "beta_max=0.5", "adaptive").published == ""  # no paper has it
     options = fields(load_algorithm("bdb_plus").Config)
     extensions = {name for name, field in options.items() if field.metadata["help"].startswith("ours")}
-    assert extensions == MOVED.keys() < OURS
+    assert extensions == MOVED.keys() < EXTENSION_SETTINGS
     assert {"td3_bc", "cql", "bdb beta=0.50", "bdb beta=adaptive"} <= known
     assert Method("bdb", "hidden=8x8", "adaptive").label == "bdb (adaptive, hidden=8x8)"
 

@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 import offbench
 from offbench.common.text import printable
-from offbench.reports.figures import Line, _legend, _tick, shortened
+from offbench.reports.figures import LineStyle, _legend, _tick, shortened
 from offbench.reports.markup import breakable, prose
 from tests.made_runs import METHODS, made_grid, made_run
 from tests.pages import HOSTILE, Page, hostile_runs
@@ -43,7 +43,7 @@ def test_long_names_are_shortened_in_pictures() -> None:
 
 def test_legend_names_that_are_cut_alike_are_numbered() -> None:
     labels = ["td3_bc", f"bdb ({'a' * 30}b{'c' * 30})", f"bdb ({'a' * 30}d{'c' * 30})"]
-    _, names = _legend([Line(label, "#000000", "-") for label in labels], 32)
+    _, names = _legend([LineStyle(label, "#000000", "-") for label in labels], 32)
     assert names[0] == " td3_bc"
     assert [name[:7] for name in names[1:]] == [" 2. bdb", " 3. bdb"]
     assert max(map(len, names)) <= 33

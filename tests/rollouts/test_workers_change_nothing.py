@@ -22,13 +22,13 @@ from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 import offbench
 from offbench.common import seeds
 from offbench.common.errors import OffbenchError
-from offbench.common.processes import quiet_start
+from offbench.common.processes import uninterrupted_start
 from offbench.common.seeds import Purpose
 from offbench.data import minari_store
 from offbench.data.collect import cut_at
 from offbench.envs.environments import env_spec, make_env
 from offbench.rollouts.policy import uniform
-from offbench.rollouts.rollouts import LANES, Episode, Rollouts, Task, gathered, play
+from offbench.rollouts.rollouts import PARALLEL_EPISODES, Episode, Rollouts, Task, gathered, play
 
 SUMS_MARGINS = tuple(map(int, mujoco.__version__.split(".")[:2])) >= (3, 5)
 POLE = env_spec("InvertedPendulum-v5")
@@ -90,7 +90,7 @@ def test_an_episode_equals_one_played_by_hand_with_gymnasium() -> None:
 
 def test_more_episodes_than_lanes_keep_their_order() -> None:
     spec, policy = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5")
-    indices = tuple(range(LANES * 2 + 3))
+    indices = tuple(range(PARALLEL_EPISODES * 2 + 3))
     together = play(Task(spec, policy.to_bytes(), 0, (), indices, False))
     for index in indices[::5]:
         (alone,) = play(Task(spec, policy.to_bytes(), 0, (), (index,), False))
@@ -141,12 +141,12 @@ def test_no_more_episodes_are_played_than_are_likely_to_be_wanted(
         begun.clear()
         with (
             Rollouts(spec, workers) as rollouts,
-            contextlib.closing(rollouts.episodes(policy, 0, enough=told)) as endless,
+            contextlib.closing(rollouts.episodes(policy, 0, transitions_needed=told)) as endless,
         ):
             found.append([episode.observations for episode in cut_at(endless, enough)])
     assert all(np.array_equal(one, other) for one, other in zip(*found, strict=True))
     assert begun == list(range(len(begun)))
-    assert len(begun) - len(found[1]) < LANES  # some 360 are wanted
+    assert len(begun) - len(found[1]) < PARALLEL_EPISODES  # some 360 are wanted
 
 
 def test_the_last_episode_is_cut_and_truncated() -> None:
@@ -166,8 +166,8 @@ def test_sigterm_to_all_processes_leaves_evaluations_to_the_parent() -> None:
     """Slurm sends it so; the parent saves a checkpoint, and that waits for the evaluations under way."""
     policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     with Rollouts(POLE, workers=2) as rollouts:
-        gathered(rollouts.outcomes(policy, 0, (), 1, True))
-        futures = rollouts.outcomes(policy, 0, (), 400, False)
+        gathered(rollouts.start_evaluation(policy, 0, (), 1, True))
+        futures = rollouts.start_evaluation(policy, 0, (), 400, False)
         assert rollouts._pool is not None
         for pid in rollouts._pool._processes:
             os.kill(pid, signal.SIGTERM)
@@ -177,10 +177,10 @@ def test_sigterm_to_all_processes_leaves_evaluations_to_the_parent() -> None:
 def test_a_killed_worker_ends_those_beside_it() -> None:
     policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     with Rollouts(POLE, workers=2) as rollouts:
-        gathered(rollouts.outcomes(policy, 0, (), 100, False))
+        gathered(rollouts.start_evaluation(policy, 0, (), 100, False))
         assert rollouts._pool is not None
         first, *beside = rollouts._pool._processes
-        futures = rollouts.outcomes(policy, 0, (), 4000, False)
+        futures = rollouts.start_evaluation(policy, 0, (), 4000, False)
         os.kill(first, signal.SIGKILL)
         with pytest.raises(OffbenchError, match="a worker process died"):
             gathered(futures)
@@ -192,7 +192,7 @@ def test_a_killed_worker_ends_those_beside_it() -> None:
 def test_leaving_the_pool_ends_what_is_being_played() -> None:
     policy = uniform(*BOUNDS, 11, "Hopper-v5")
     with Rollouts(env_spec("Hopper-v5"), workers=1) as rollouts:
-        assert len(gathered(rollouts.outcomes(policy, 0, (), 1, False))) == 1
+        assert len(gathered(rollouts.start_evaluation(policy, 0, (), 1, False))) == 1
         many = Task(rollouts.spec, policy.to_bytes(), 0, (), tuple(range(10**6)), False)
         future = rollouts.call(play, many)
         while not future.running():
@@ -207,7 +207,7 @@ def test_a_stop_that_another_thread_takes_waits_until_a_worker_has_started(stop:
     before = signal.signal(stop, signal.default_int_handler)
 
     def start() -> None:
-        with quiet_start():
+        with uninterrupted_start():
             os.kill(os.getpid(), stop)
             time.sleep(0.2)
             started.append(True)

@@ -25,8 +25,8 @@ from offbench.common.provenance import hardware, has_bfloat16
 from offbench.common.tables import markdown
 from offbench.envs.environments import make_env
 from offbench.envs.recipes import load_recipe
-from offbench.rollouts.rollouts import LANES, Task, play
-from offbench.training.captured_update import RECORDED
+from offbench.rollouts.rollouts import PARALLEL_EPISODES, Task, play
+from offbench.training.captured_update import RECORDED_UPDATES
 from tests.speed.__main__ import DOCS
 from tests.speed.sides import ENV, stack_of
 
@@ -43,7 +43,7 @@ def recording() -> dict[str, float]:
     ladder = read_ladder(recipe.folder / "behaviour")
     assert ladder is not None
     policy = ladder.load(ladder.role("medium")).to_bytes()
-    task = Task(recipe.env_spec(), policy, 0, (), tuple(range(LANES)), False)
+    task = Task(recipe.env_spec(), policy, 0, (), tuple(range(PARALLEL_EPISODES)), False)
     episodes = play(task)
     env = make_env(task.spec)
     inner: Any = env.unwrapped
@@ -82,7 +82,7 @@ def update(algorithm: str, precision: str) -> dict[str, float]:
     """Return milliseconds of an update (2-layer networks), by what a replay calls."""
     with products_by("bfloat16" if precision == "bfloat16" else "numpy"):
         stack = stack_of(algorithm)
-        for _ in stack.train(2 * RECORDED):  # records each phase
+        for _ in stack.train(2 * RECORDED_UPDATES):  # records each phase
             pass
     kinds = [list(calls(recording)) for recording in stack.program._recordings.values()]
     spent: dict[str, float] = {}

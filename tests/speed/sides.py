@@ -175,7 +175,7 @@ def load_unchecked(dataset_id: str) -> Work:
 
     known = file_stamps.dataset_stamps(dataset_id)
     file_stamps.dataset_stamps = lambda _: known
-    transitions.checked = unchecked  # type: ignore[assignment]
+    transitions.check_files = unchecked  # type: ignore[assignment]
     return load_cached(dataset_id)
 
 
@@ -207,7 +207,7 @@ def evaluate(workers: str, episodes: str = "20") -> Work:
     numbers = itertools.count()
 
     def work() -> int:
-        return len(gathered(rollouts.outcomes(policy, next(numbers), (0,), int(episodes), True)))
+        return len(gathered(rollouts.start_evaluation(policy, next(numbers), (0,), int(episodes), True)))
 
     return work
 

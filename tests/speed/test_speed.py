@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from offbench.rollouts.rollouts import LANES
+from offbench.rollouts.rollouts import PARALLEL_EPISODES
 from tests.speed import gpu, profile
 from tests.speed.__main__ import environment, line
 from tests.speed.rows import peer, side
@@ -45,7 +45,7 @@ def test_a_profile_adds_up(monkeypatch: pytest.MonkeyPatch) -> None:
     alone, environment_rest, worker_rest = profile.recording().values()
     assert alone > 0  # one second an episode
     assert environment_rest == 0  # as many episodes as of the physics alone
-    assert alone + worker_rest == pytest.approx(alone / LANES)  # all episodes are one play
+    assert alone + worker_rest == pytest.approx(alone / PARALLEL_EPISODES)  # all episodes are one play
     for algorithm in ("td3_bc", "bdb", "cql"):
         parts = profile.update(algorithm, "float32")
         assert parts.keys() == {profile.PRODUCTS, profile.ACTIVATIONS, profile.OPTIMISER, profile.REST}

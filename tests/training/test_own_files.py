@@ -62,7 +62,7 @@ def test_a_file_trains_resumes_and_reports(home: Path, capsys: pytest.CaptureFix
     assert whole.losses_path.read_bytes() == pieces.losses_path.read_bytes()
     assert pieces.folder == Path("runs") / DATA / "AWAC" / "batch_size=16,hidden=8x8" / "seed-0"
     again(home)
-    del os.environ[registry.OWN]
+    del os.environ[registry.OWN_VARIABLE]
     said = refusal(["evaluate", str(pieces.folder), "--similarity"], capsys)
     assert "unknown algorithm 'AWAC'" in said
     assert "for a file of your own, give --algorithm ./FILE.py:CLASS" in said
@@ -222,11 +222,11 @@ def test_an_edit_of_an_imported_neighbor_is_noticed(home: Path) -> None:
     (home / "awac.py").write_text(
         "from losses import WEIGHT\n" + EXAMPLE.replace("from __future__ import annotations\n", "")
     )
-    before = code_of(registry.use("awac.py"))
+    before = code_of(registry.register("awac.py"))
     again(home)
     (home / "losses.py").write_text("WEIGHT = 50\n")
-    assert changes(before, code_of(registry.use("awac.py"))) == "losses.py has changed"
-    assert changes({}, code_of(registry.use("awac.py"))) == ""  # a run of an earlier version
+    assert changes(before, code_of(registry.register("awac.py"))) == "losses.py has changed"
+    assert changes({}, code_of(registry.register("awac.py"))) == ""  # a run of an earlier version
 
 
 LAYOUTS = {  # how the file imports a neighbor, and the neighbor
@@ -249,11 +249,11 @@ def test_an_edit_is_noticed_however_a_neighbor_is_imported(line: str, home: Path
     (home / "parts" / "relative.py").write_text("from . import losses\nWEIGHT = losses.WEIGHT\n")
     (home / "parts" / "absolute.py").write_text("from parts.losses import WEIGHT\n")
     (home / "my_algo.py").write_text(f"import torch\n{line}\nfrom offbench.algos.bc import BC\nclass Mine(BC): pass\n")
-    before = code_of(registry.use("my_algo.py"))
+    before = code_of(registry.register("my_algo.py"))
     assert before.keys() <= {"bc.py", "my_algo.py", "losses.py", *(f"parts/{p.name}" for p in home.glob("parts/*.py"))}
     again(home)
     (home / LAYOUTS[line]).write_text("WEIGHT = 2\n")
-    assert changes(before, code_of(registry.use("my_algo.py"))) == f"{LAYOUTS[line]} has changed"
+    assert changes(before, code_of(registry.register("my_algo.py"))) == f"{LAYOUTS[line]} has changed"
 
 
 def test_files_of_a_package_that_are_no_python_of_today_are_hashed_all_the_same(home: Path) -> None:
@@ -266,11 +266,11 @@ def test_files_of_a_package_that_are_no_python_of_today_are_hashed_all_the_same(
     sys.path.insert(0, str(home))
     algorithm = importlib.import_module("space.algo").Mine
     files = {"bc.py", "space/algo.py", "space/template.py", "space/latin.py"}
-    before = code_of(registry.use(algorithm))
+    before = code_of(registry.register(algorithm))
     assert set(before) == files
     source_code._codes.clear()
     (home / "space" / "template.py").write_text("print 'goodbye {{ name }}'\n")
-    assert changes(before, code_of(registry.use(algorithm))) == "space/template.py has changed"
+    assert changes(before, code_of(registry.register(algorithm))) == "space/template.py has changed"
 
 
 def test_an_edit_of_a_package_and_another_version_are_noticed(home: Path) -> None:
@@ -312,12 +312,12 @@ def test_runs_of_one_script_are_known_by_the_class_alone(home: Path, capsys: pyt
     text = """
 from offbench.algos.bc import BC
 from offbench.training.source_code import code_of
-from offbench.training.registry import use
+from offbench.training.registry import register
 
 class Mine(BC):
     {}
 
-print(code_of(use(Mine)))
+print(code_of(register(Mine)))
 """
     found = []
     for body in ("pass", "pass  # a comment", "x = 1"):
@@ -341,12 +341,12 @@ def test_no_file_that_a_run_folder_names_is_imported(home: Path) -> None:
 def test_two_algorithms_of_one_name_are_refused(home: Path) -> None:
     for name in ("one", "two"):
         (home / f"{name}.py").write_text("from offbench.algos.bc import BC\nclass Mine(BC): pass\n")
-    registry.use("one.py")
+    registry.register("one.py")
     with pytest.raises(OffbenchError, match="two algorithms are named 'Mine', in one and two"):
-        registry.use("two.py")
+        registry.register("two.py")
     (home / "three.py").write_text("from offbench.algos.bc import BC\nclass cql(BC): pass\n")
     with pytest.raises(OffbenchError, match="an algorithm of a package is named 'cql' too"):
-        registry.use("three.py")
+        registry.register("three.py")
 
 
 def test_tables_mark_a_cell_of_different_code(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -280,7 +280,7 @@ def test_what_trained_a_run_later_is_noted_if_it_is_something_else(
     train("td3_bc", medium, "runs", 200)
     assert run.config().sessions == ()
     elsewhere = {"device": "cuda", "precision": "tf32", "versions": {"torch": "9"}, "hardware": {"cores": 99}}
-    monkeypatch.setattr("offbench.training.trainer.made_with", lambda *_: elsewhere)
+    monkeypatch.setattr("offbench.training.trainer.training_platform", lambda *_: elsewhere)
     for steps in (300, 400):
         train("td3_bc", medium, "runs", steps)
     config = run.config()

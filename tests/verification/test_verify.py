@@ -365,7 +365,7 @@ def test_workers_find_the_same(medium: str, monkeypatch: pytest.MonkeyPatch) -> 
             shift_early(group)
 
     tamper(medium, edit)
-    monkeypatch.setattr("offbench.verification.verify.FEW", 0)
+    monkeypatch.setattr("offbench.verification.verify.FEW_STEPS", 0)
     assert verify(medium, workers=2).findings == verify(medium, workers=1).findings
 
 
