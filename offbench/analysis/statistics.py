@@ -108,7 +108,7 @@ class Paired:
 
 
 def paired(differences: Scores) -> Paired:
-    """Return the statistics of A - B, given each task's differences (one a seed that both have)."""
+    """Return the statistics of A - B from the differences of each task, one for each seed that both have."""
     every = np.concatenate([np.asarray(values, np.float64) for values in differences.values()])
     spread = float(every.std(ddof=1)) if len(every) > 1 else 0.0
     return Paired(

@@ -67,7 +67,7 @@ def trusting() -> Iterator[None]:
 
 
 def is_trusting() -> bool:
-    """Return whether the user trusts the files given."""
+    """Return whether the user trusts the files of this command (--trust)."""
     return os.environ.get(VARIABLE, "") not in ("", "0")
 
 
