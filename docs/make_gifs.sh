@@ -1,6 +1,6 @@
 #!/bin/sh
 # Create the animations of docs/datasets.md: random, medium and expert of each given environment (default: hopper).
-#   docs/make_gifs.sh hopper walker2d halfcheetah
+#   docs/make_gifs.sh hopper walker2d halfcheetah ant
 set -eu
 BIN=${BIN:-.venv/bin}
 for env in "${@:-hopper}"; do
