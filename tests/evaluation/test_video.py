@@ -99,7 +99,7 @@ def test_the_users_choice_of_backend_is_put_back(monkeypatch: pytest.MonkeyPatch
         (["hopper:medium-replay", "--out", "a.gif"], "not of one policy"),
         (["hopper:mediun", "--out", "a.gif"], "did you mean 'medium'"),
         (["hoper:medium", "--out", "a.gif"], "did you mean 'hopper'"),
-        (["ant:medium", "--out", "a.gif"], "no ladder"),
+        (["./swimmer.toml:medium", "--out", "a.gif"], "no ladder"),
         (["nothing", "--out", "a.gif"], "no run or policy file"),
         ([str(POLICY), "--out", "new/a.gif"], "cannot write new/a.gif: there is no folder new"),
         ([str(POLICY), "--env", "hopper", "--out", "a.gif"], "--env RECIPE"),
@@ -108,6 +108,7 @@ def test_the_users_choice_of_backend_is_put_back(monkeypatch: pytest.MonkeyPatch
     ],
 )
 def test_bad_input_is_one_line(words: list[str], text: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (home / "swimmer.toml").write_text('env_id = "Swimmer-v5"')
     assert text in refusal(["video", *words], capsys)
     assert not list(home.glob("*.gif"))
 
