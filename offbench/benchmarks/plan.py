@@ -131,14 +131,15 @@ class Plan:
         step_time = float(np.mean([step_seconds(text) for text in env_specs.values()]))
         self._seconds = self._disk = self._products = 0.0  # of the lines so far
         to_train = [specs for specs in left if specs]
-        widths = max(len(_name(specs[0])) for specs in to_train), max(len(f"{specs[0].steps:,}") for specs in to_train)
-        for specs in to_train:
-            yield self._variant(specs, env_spec, step_time, *widths)
+        names = _names(to_train)
+        widths = max(map(len, names)), max(len(f"{specs[0].steps:,}") for specs in to_train)
+        for name, specs in zip(names, to_train, strict=True):
+            yield self._variant(specs, env_spec, step_time, f"{name:<{widths[0]}}", widths[1])
         if missing := bench.missing():
             yield self._recording(missing, env_spec, step_time)
         yield from self._total()
 
-    def _variant(self, specs: Sequence[RunSpec], env_spec: str, step_time: float, name_width: int, width: int) -> str:
+    def _variant(self, specs: Sequence[RunSpec], env_spec: str, step_time: float, name: str, width: int) -> str:
         spec, machine, runs = specs[0], self.bench.machine, len(specs)
         rate = measure(spec, env_spec, machine.device)
         run_seconds = _cost(spec, rate, step_time, env_spec)
@@ -149,10 +150,8 @@ class Plan:
         self._disk += 2 * rate.bytes_per_run * runs
         if machine.device == "cpu":
             self._products += left * spec.steps * operations(spec, env_spec)
-        return (
-            f"  {_name(spec):<{name_width}}{runs:>4} runs x {spec.steps:>{width},} updates "
-            f"at {rate.updates:>5,.0f}/s: {duration(cost)}"
-        )
+        size = f"{counted(runs, 'run'):>9} x {spec.steps:>{width},} updates"
+        return f"  {name}{size} at {rate.updates:>5,.0f}/s: {duration(cost)}"
 
     def _recording(self, missing: Sequence[Source], spec: str, step_time: float) -> str:
         steps = sum(_size(source) for source in missing)
@@ -202,6 +201,9 @@ def _bytes_per_step(spec: str) -> int:
     return 12 * observations.shape[0] + 8 * actions.shape[0] + 34
 
 
-def _name(spec: RunSpec) -> str:
-    """Return a run's method as tables name it."""
-    return spec.label or method_of(spec.algorithm, spec.variant, settings_json(spec.config)).label
+def _names(variants: Sequence[Sequence[RunSpec]]) -> list[str]:
+    """Return the variants' methods as tables name them; those of one name with their datasets."""
+    first = [specs[0] for specs in variants]
+    names = [spec.label or method_of(spec.algorithm, spec.variant, settings_json(spec.config)).label for spec in first]
+    datasets = [", ".join(dict.fromkeys(spec.dataset for spec in specs)) for specs in variants]
+    return [f"{name} ({ids})" if names.count(name) > 1 else name for name, ids in zip(names, datasets, strict=True)]

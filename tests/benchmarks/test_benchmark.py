@@ -136,7 +136,9 @@ def test_settings_of_each_dataset_are_one_column(home: Path) -> None:
         text += f'[[algorithms]]\nname = "bc"\nlabel = "tuned"\ndatasets = ["{name[0]}-*"]\nlearning_rate = {rate}\n'
     (home / "grid.toml").write_text(text)
     bench = prepare("./grid.toml", workers=1)
-    assert next(iter(Plan(bench))) == "grid: 2 datasets, 2 variants, 2 runs, 2 to train"
+    first, *lines = Plan(bench)
+    assert first == "grid: 2 datasets, 2 variants, 2 runs, 2 to train"
+    assert [line.partition("    1 run x")[0] for line in lines[:2]] == ["  tuned (a-v0)", "  tuned (b-v0)"]
     assert benchmark(bench, say=silent)
     rows = [(row["dataset"], row["method"], row["variant"]) for row in offbench.normalize()]
     assert rows == [("a-v0", "tuned", "learning_rate=0.001"), ("b-v0", "tuned", "learning_rate=0.0001")]
