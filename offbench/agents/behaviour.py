@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from offbench.agents.build_ladder import build_ladder, check_output_folder
@@ -48,6 +49,7 @@ def behaviour(
     folder = TrainingFolder(recipe, seed, folder_of(recipe, seed, Path(behaviour_dir)))
     ladder = check_output_folder(Path(out) if out else folder.path / "ladder")
     train(folder, steps)
-    command = f"offbench behaviour {recipe.name} --seed {seed} --steps {steps}"
+    name = shlex.quote(env) if isinstance(env, str) else recipe.name
+    command = f"offbench behaviour {name} --seed {seed} --steps {steps}"
     with folder.locked():
         return build_ladder(folder, steps, ladder, default_workers(workers), command)

@@ -171,13 +171,18 @@ def folder_of(recipe: Recipe, seed: int, behaviour_dir: Path) -> Path:
     return behaviour_dir / recipe.name / f"seed-{seed}"
 
 
+def shipped_ladder(recipe: Recipe) -> Ladder | None:
+    """Return the ladder that is shipped with a recipe, if there is one."""
+    return read_ladder(recipe.folder / "behaviour") if recipe.folder else None
+
+
 def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool = False) -> Ladder | None:
     """Return the shipped ladder (unless `retrain`), else the one trained here, else None.
 
     Raises:
         OffbenchError: it is damaged, or of another environment.
     """
-    shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder and not retrain else None
+    shipped = None if retrain else shipped_ladder(recipe)
     trained = folder_of(recipe, 0, behaviour_dir) / "ladder"
     if not shipped and replaced_folder(trained).exists():
         with contextlib.suppress(OffbenchError), exclusive_lock(trained.parent / ".lock", str(trained)):
@@ -224,7 +229,7 @@ def shipped_references(spec: str) -> tuple[float, float] | None:
         # the id first: making the spec of every recipe takes a while
         if recipe.env_id != json.loads(spec).get("id") or not same_environment(recipe.env_spec(), spec):
             continue
-        if recipe.folder and (ladder := read_ladder(recipe.folder / "behaviour")):
+        if ladder := shipped_ladder(recipe):
             return ladder.random_return, ladder.expert_return
     return None
 

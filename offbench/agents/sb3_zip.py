@@ -24,6 +24,7 @@ from offbench.common.files import JsonObject, damage, open_regular
 from offbench.rollouts.policy import ACTIVATIONS, Layers, Policy
 
 LARGEST = 2**30  # bytes of a member, unpacked
+FLATTEN = "<class 'stable_baselines3.common.torch_layers.FlattenExtractor'>"  # of an MLP policy: changes no vector
 
 
 def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
@@ -34,7 +35,7 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
 
     Raises:
         OffbenchError: not such a zip, a damaged or malicious one, a policy that is not an MLP's, or one for
-            observations that VecNormalize has normalized.
+            observations that VecNormalize has normalized (recognized for PPO and A2C only).
     """
     try:
         with damage(str(path), "is not a readable zip of Stable-Baselines3", "save the agent again"):
@@ -43,6 +44,12 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
         raise OffbenchError(f"no file {path}") from None
     if settings.get("use_sde") is True:
         raise OffbenchError(f"{path} uses gSDE exploration, which offbench does not play")
+    kwargs = settings.get("policy_kwargs")
+    extractor = str(kwargs.get("features_extractor_class", "")) if isinstance(kwargs, dict) else ""
+    if extractor not in ("", FLATTEN) or any("features_extractor." in name for name in tensors):
+        raise OffbenchError(
+            f"{path} has a features extractor of its own; give --policy module:function, which acts as it"
+        )
     kind, layers, algorithm, default = _layers(path, tensors)
     activation = _activation(path, settings, default)
     if any(not np.isfinite(array).all() for pair in layers for array in pair):

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
-from offbench.agents.ladder import BEHAVIOUR, folder_of, read_ladder
+from offbench.agents.ladder import BEHAVIOUR, folder_of, read_ladder, shipped_ladder
 from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import Entry, entries_of, mixed_code, read_results
 from offbench.analysis.statistics import iqm
@@ -101,8 +101,7 @@ def score_returns(env: str, returns: Sequence[float]) -> list[Row]:
     recipe = load_recipe(env)
     if not all(abs(value) < scores.LARGEST_VALUE for value in returns):
         raise OffbenchError(f"returns must be finite numbers below {scores.LARGEST_VALUE:g}, not {list(returns)}")
-    shipped = read_ladder(recipe.folder / "behaviour") if recipe.folder else None
-    ladder = shipped or read_ladder(folder_of(recipe, 0, BEHAVIOUR) / "ladder")
+    ladder = shipped_ladder(recipe) or read_ladder(folder_of(recipe, 0, BEHAVIOUR) / "ladder")
     ours = (ladder.random_return, ladder.expert_return) if ladder and ladder.check(recipe) else None
     d4rl = (recipe.d4rl_min, recipe.d4rl_max) if recipe.d4rl_min is not None else None
     if not ours and not d4rl:

@@ -26,7 +26,7 @@ from offbench.common.files import READ_REMEDIES
 from offbench.common.scores import SCORED_EVALUATIONS, Evaluations, mean_std, normalize, run_return, window
 from offbench.common.terminal import warn
 from offbench.common.text import from_to, plural
-from offbench.data.levels import LEVELS
+from offbench.data.levels import FRACTION, LEVELS
 from offbench.envs.environments import same_environment
 from offbench.training.run import DIGITS, Run, RunConfig, find_runs
 
@@ -62,7 +62,7 @@ class Task:
     def env_and_level(self) -> tuple[str, str]:
         """(environment, level), read from the dataset id; the level is "" if the id has none."""
         stem = re.sub(r"-v\d+$", "", self.dataset)
-        match = re.fullmatch(rf"(.+?)[-/]({'|'.join(sorted(LEVELS, key=len, reverse=True))}|\d+percent)", stem)
+        match = re.fullmatch(rf"(.+?)[-/]({'|'.join(sorted(LEVELS, key=len, reverse=True))}|{FRACTION})", stem)
         return (match[1].split("/")[-1], match[2]) if match else (stem, "")
 
 

@@ -12,7 +12,7 @@ from offbench.agents.sb3_zip import read_sb3_zip
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import sha256
-from offbench.data.levels import LEVELS
+from offbench.data.levels import FRACTION, LEVELS
 from offbench.rollouts.function_policy import FunctionPolicy, function_policy
 from offbench.rollouts.policy import Policy, load_policy
 
@@ -76,6 +76,6 @@ def level_name(name: str | None, source: str) -> str:
     level = name or own or "policy"
     if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", level):
         raise OffbenchError(f"--name may hold a-z, 0-9 and single hyphens, not {level!r}")
-    if level in LEVELS or re.fullmatch(r"\d+percent", level):
+    if level in LEVELS or re.fullmatch(FRACTION, level):
         raise OffbenchError(f"{level!r} is a level of offbench's own agents; give another --name")
     return level

@@ -7,7 +7,10 @@ import functools
 import itertools
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+
+import numpy.typing as npt
 
 from offbench.agents.build_ladder import random_reference
 from offbench.agents.ladder import BEHAVIOUR, MEDIUM, MEDIUM_AT_MOST, MEDIUM_LIMITS, NEAR, Ladder, Rung, find_ladder
@@ -115,13 +118,13 @@ def collect(
         return dataset_id
     with minari_store.claimed(dataset_id, overwrite) as path:
         if prepared is None:
-            ladder = _train(recipe, Path(behaviour_dir), workers)
+            ladder = _train(env, Path(behaviour_dir), workers)
             prepared = prepare(ladder)
         recording, sources, counts, metadata = prepared
         total = sum(counts)
         with Progress(total, f"recording {dataset_id}") as progress:
             streams = (recording.episodes(*item) for item in zip(parts, sources, counts, itertools.count()))
-            episodes = _counted(itertools.chain.from_iterable(streams), progress)
+            episodes = _counted(itertools.chain.from_iterable(streams), progress, recording.spaces[1].dtype)
             content = minari_writer.write(path, episodes, recording.spec, metadata, total, recording.spaces)
     if seed == 0 and steps is None and not retrain and (comparison := compare_with_card(recipe, name, content)):
         inform(comparison)
@@ -148,35 +151,29 @@ def _is_same(dataset_id: str, wanted: JsonObject) -> bool:
     return same
 
 
-def _train(recipe: Recipe, behaviour_dir: Path, workers: int) -> Ladder:
+def _train(env: str, behaviour_dir: Path, workers: int) -> Ladder:
     """Train the recipe's behaviour agent now."""
     from offbench.agents.behaviour import behaviour
 
+    recipe = load_recipe(env)
     recipe.env_spec()  # refuses a bad environment before the training is announced
     inform(f"{recipe.name} has no behaviour agent in {behaviour_dir} yet; training one first")
-    return behaviour(recipe, behaviour_dir=behaviour_dir, workers=workers)
+    return behaviour(env, behaviour_dir=behaviour_dir, workers=workers)
 
 
 def _counts(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...], steps: int | None) -> list[int]:
     """Return the transitions of each part; medium-replay alone has all transitions of the training."""
-    available = ladder.info.medium_replay.transitions if ladder else 0
-    total = steps if steps is not None else _full_size(recipe, ladder, parts)
+    available = ladder.info.medium_replay.transitions if ladder else None
+    total = steps if steps is not None else full_size(parts, recipe.dataset_steps, available)
     counts = shares(parts, total)
     if 0 in counts:
         raise OffbenchError(f"{total} steps leave a part of the blend without a transition; use more --steps")
     for part, count in zip(parts, counts, strict=True):
-        if part.source == "replay" and count > available:
+        if part.source == "replay" and available is not None and count > available:
             raise OffbenchError(
                 f"medium-replay of {recipe.name} has {available:,} transitions, not {count:,}; use fewer --steps"
             )
     return counts
-
-
-def _full_size(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...]) -> int:
-    """Return the transitions of a dataset at its full size."""
-    if ladder and len(parts) == 1 and parts[0].source == "replay":
-        return ladder.info.medium_replay.transitions
-    return full_size(parts, recipe.dataset_steps)
 
 
 class _Recording:
@@ -325,9 +322,10 @@ def cut_at(episodes: Iterator[Episode], count: int) -> Iterator[Episode]:
             return
 
 
-def _counted(episodes: Iterator[Episode], progress: Progress) -> Iterator[Episode]:
+def _counted(episodes: Iterator[Episode], progress: Progress, dtype: npt.DTypeLike) -> Iterator[Episode]:
+    """Yield the episodes, with actions of the action space's `dtype`, and count their steps."""
     for episode in episodes:
-        yield episode
+        yield replace(episode, actions=episode.actions.astype(dtype, copy=False))
         progress.to(progress.done + len(episode))
 
 
@@ -342,7 +340,8 @@ def _metadata(
     """Return the dataset's metadata: Minari's fields, and offbench's own under one key."""
     recipe, references, made = recording.recipe, recording.references, versions()
     described = [recording.describe(*item) for item in zip(parts, sources, counts, strict=True)]
-    full, total = _full_size(recipe, recording._ladder, parts), sum(counts)
+    replay_steps = recording._ladder.info.medium_replay.transitions if recording._ladder else None
+    full, total = full_size(parts, recipe.dataset_steps, replay_steps), sum(counts)
     short = f" A short recording: {total:,} of {full:,} transitions." if total < full else ""
     origin_texts = [recording.origin_text(part, rung) for part, rung in zip(parts, sources, strict=True)]
     if recording.own_policy:

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
-from minari.serialization import serialize_space
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
@@ -28,6 +27,7 @@ from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.progress import Progress
 from offbench.data import minari_store
 from offbench.data.content_hash import ContentHash
+from offbench.data.d4rl_file import KEPT
 from offbench.data.file_stamps import unchanged
 from offbench.data.minari_reader import episodes_of, finite, flags, float32, open_minari, reading, shape_faults
 from offbench.envs.environments import box
@@ -36,10 +36,6 @@ if TYPE_CHECKING:
     from minari import MinariDataset
 
 FORMATS = {"d4rl": (".hdf5", ".h5"), "npz": (".npz",)}  # and how their files end
-METADATA = (  # fields of Minari's metadata that an export keeps
-    *("env_spec", "eval_env_spec", "algorithm_name", "description", "author", "author_email", "requirements"),
-    *("ref_min_score", "ref_max_score", "num_episodes_average_score", minari_store.KEY),
-)
 CHUNK = 16_384  # rows of a compressed piece
 PIECE = 1 << 20  # bytes copied at once
 ATTRIBUTE = 60_000  # bytes that HDF5 lets an attribute have
@@ -88,7 +84,7 @@ def _write(dataset_id: str, path: Path, style: str, drop_timeouts: bool) -> None
     with Progress(int(data.total_steps), f"exporting {dataset_id}") as progress:
         columns = _columns(data, dataset_id, progress, content)
         if style == "d4rl":
-            _write_d4rl(path, columns, _about(data, metadata))
+            _write_d4rl(path, columns, _about(metadata))
         else:
             dropped = minari_store.provenance(metadata).timeouts == "dropped"
             _write_npz(path, (_float32(part, dataset_id) for part in columns), drop_timeouts, dropped)
@@ -143,10 +139,9 @@ def _seed_columns(data: MinariDataset, dataset_id: str) -> Callable[[int | None,
     }
 
 
-def _about(data: MinariDataset, metadata: JsonObject) -> str:
+def _about(metadata: JsonObject) -> str:
     """Return the metadata that the file keeps, as JSON."""
-    about = {key: metadata[key] for key in METADATA if metadata.get(key) is not None}
-    about |= {key: serialize_space(getattr(data, key)) for key in ("observation_space", "action_space")}
+    about = {key: metadata[key] for key in KEPT if metadata.get(key) is not None}
     text = json.dumps(about)
     if len(text.encode()) > ATTRIBUTE:
         raise OffbenchError(f"{metadata.get('dataset_id')} has more metadata than a D4RL file can carry; shorten them")
@@ -173,11 +168,13 @@ def _write_d4rl(path: Path, parts: Iterator[Columns], about: str) -> None:
 def _blocks(parts: Iterator[Columns]) -> Iterator[Columns]:
     """Join episodes to blocks of at least CHUNK rows."""
     waiting: list[Columns] = []
+    rows = 0
     for part in parts:
         waiting.append(part)
-        if sum(len(columns["rewards"]) for columns in waiting) >= CHUNK:
+        rows += len(part["rewards"])
+        if rows >= CHUNK:
             yield _joined(waiting)
-            waiting = []
+            waiting, rows = [], 0
     if waiting:
         yield _joined(waiting)
 

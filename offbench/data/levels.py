@@ -23,6 +23,8 @@ class Part:
     weight: float = 1.0
 
 
+FRACTION = r"\d+(?:p\d+)?percent"  # the name of a fraction in a dataset id: 60percent, 12p5percent
+
 LEVELS: dict[str, tuple[Part, ...]] = {  # in order of their mean return
     "random": (Part("uniform"),),
     "medium-replay": (Part("replay"),),
@@ -91,8 +93,15 @@ def parse_mix(text: str) -> tuple[str, tuple[Part, ...]]:
     return "-".join(names), tuple(parts)
 
 
-def full_size(parts: tuple[Part, ...], dataset_steps: int) -> int:
-    """Return the transitions of a level, `dataset_steps` being the recipe's of one part."""
+def full_size(parts: tuple[Part, ...], dataset_steps: int, replay_steps: int | None = None) -> int:
+    """Return the transitions of a level.
+
+    Args:
+        dataset_steps: the recipe's, of one part.
+        replay_steps: those of the ladder's medium-replay, which is recorded whole; None without a ladder.
+    """
+    if replay_steps is not None and [part.source for part in parts] == ["replay"]:
+        return replay_steps
     return round(dataset_steps * sum(part.weight for part in parts))
 
 

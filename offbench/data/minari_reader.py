@@ -1,4 +1,4 @@
-"""A dataset's episodes as Minari reads them, unchecked."""
+"""Local datasets as Minari reads them, opened after a check of their files, and checks of their arrays."""
 
 from __future__ import annotations
 

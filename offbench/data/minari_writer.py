@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator
@@ -68,6 +69,8 @@ def write(
                 )
             ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
             storage.update_metadata(metadata | {KEY: ours})
+            with open(temporary / "data" / "metadata.json", "rb") as file:
+                os.fsync(file.fileno())
             _write_namespaces(path)
             check_ownership(temporary)
             if path.exists():
@@ -119,7 +122,7 @@ def _buffers(
 def _check_room(folder: Path, storage: MinariStorage, steps: int) -> None:
     """Raise OffbenchError if the disk has no room for the dataset (episodes of 100 steps assumed)."""
     width = storage.observation_space.shape[0] * storage.observation_space.dtype.itemsize
-    width += storage.action_space.shape[0] * 4 + 10
+    width += storage.action_space.shape[0] * storage.action_space.dtype.itemsize + 10
     need = steps * width + steps // 100 * BYTES_PER_EPISODE
     free = shutil.disk_usage(folder).free
     if free < need:

@@ -188,7 +188,7 @@ def _read_converted(folder: Path, sources: Mapping[str, Path]) -> tuple[str, dic
 
 
 def cache() -> Path:
-    """Return the folder of converted datasets: $OFFBENCH_CACHE, else ~/.cache/offbench."""
+    """Return the folder of converted datasets: $OFFBENCH_CACHE, else offbench in $XDG_CACHE_HOME or ~/.cache."""
     path = os.environ.get("OFFBENCH_CACHE")
     if path:
         return Path(path)
@@ -228,7 +228,7 @@ def _convert(
             progress.to(progress.done + lengths[-1])
     if not lengths:
         raise OffbenchError(f"{dataset_id} has no episodes; record it again")
-    arrays = {name: np.concatenate(parts) for name, parts in columns.items()}
+    arrays = {name: np.concatenate(columns.pop(name)) for name in tuple(columns)}  # frees each column's parts
     arrays["actions"] = _scaled(arrays["actions"], actions, dataset_id)
     ends = np.cumsum(lengths)
     # each earlier episode put one extra observation row (its last) before this transition

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import inspect
 import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -65,15 +67,12 @@ class FunctionPolicy:
         return FUNCTION_PREFIX + self.name.encode() + b"\0" + bounds
 
     def source(self) -> bytes:
-        """Return the source of the module, for its hash."""
-        try:
-            path = inspect.getsourcefile(self.function)
-        except TypeError:  # a function in C has none
-            path = None
-        if path is None or not os.path.exists(path):
-            return self.name.encode()
-        with open(path, "rb") as file:
-            return file.read()
+        """Return the source of the module, and of the one that defines the function if it is another, for its hash."""
+        paths = [getattr(sys.modules.get(self.name.partition(":")[0]), "__file__", None)]
+        with contextlib.suppress(TypeError):  # a function in C and an object that is called have none
+            paths.append(inspect.getsourcefile(inspect.unwrap(self.function)))
+        files = [Path(path) for path in dict.fromkeys(paths) if path and os.path.isfile(path)]
+        return b"".join(file.read_bytes() for file in files) or self.name.encode()
 
 
 def function_policy(name: str, low: Array, high: Array) -> FunctionPolicy:

@@ -48,7 +48,7 @@ class Episode:
     Attributes:
         seed: what the environment was reset with.
         observations: [T + 1, obs], in the environment's own precision; the last one has no action.
-        actions: [T, act] float32, in the environment's bounds.
+        actions: [T, act], in the environment's bounds and precision.
         rewards: [T] float64.
         terminated, truncated: how it ended, as in Gymnasium.
     """
@@ -106,7 +106,8 @@ def summary(episode_stats: list[EpisodeStats], prefix: str = "") -> dict[str, fl
     mean, low, high = interval([o.ret for o in episode_stats])
     length = float(np.mean([o.length for o in episode_stats]))
     values = {"return": mean, "low": low, "high": high, "length": length}
-    return {prefix + key: round(value, 4) for key, value in values.items()}
+    # four decimals, or five digits of a small number: rewards may be tiny
+    return {prefix + k: round(v, 4) if abs(v) >= 1 else float(f"{v:.5g}") for k, v in values.items()}
 
 
 class _RunningEpisode:
@@ -134,9 +135,9 @@ class _RunningEpisode:
 
     def step(self, action: Array) -> Episode | None:
         """Take one step; return the whole episode if it was the last one."""
-        observation, reward, terminated, truncated = step(self.env, action)
+        self.actions.append(action.astype(self.env.action_space.dtype))
+        observation, reward, terminated, truncated = step(self.env, self.actions[-1].copy())  # it may change it
         self.observations.append(observation)
-        self.actions.append(action)
         self.rewards.append(reward)
         if not (terminated or truncated):
             if len(self.rewards) > self.limit:

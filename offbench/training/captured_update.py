@@ -34,7 +34,8 @@ class Program:
         self.position = torch.zeros(1, dtype=torch.int64, device=self.device)
         self.indices, self.noise = torch.empty(0), dict[str, Tensor]()
         self.sums: dict[str, Tensor] = {}
-        self.counts: Counter[str] = Counter()  # updates in each of `sums`
+        self.counts: Counter[str] = Counter()  # updates in each of `sums`, without those of an earlier session
+        self.earlier: list[Counter[str]] = [Counter() for _ in store.sizes]  # those, which differ from run to run
         self._names: dict[Hashable, list[str]] = {}  # what each phase logs
         self._graphs: dict[Hashable, torch.cuda.CUDAGraph] = {}
         self._recordings: dict[Hashable, Recording] = {}
@@ -136,20 +137,28 @@ class Program:
             self.sums[name] += value.detach()
         self.position += 1
 
-    def logged(self) -> dict[str, list[float]]:
+    def logged(self) -> list[dict[str, float]]:
         """Return each run's mean of everything logged since the last call: the loop's only synchronization."""
-        means = {name: (self.sums[name] / count).tolist() for name, count in self.counts.items()}
-        for total in self.sums.values():
+        means: list[dict[str, float]] = [{} for _ in self.earlier]
+        for name, total in self.sums.items():
+            counts = [self.counts[name] + earlier[name] for earlier in self.earlier]
+            for mean, value, count in zip(
+                means, (total / torch.tensor(counts).to(total)).tolist(), counts, strict=True
+            ):
+                if count:
+                    mean[name] = value
             total.zero_()
-        self.counts.clear()
+        for counter in (self.counts, *self.earlier):
+            counter.clear()
         return means
 
     def unlogged(self, run: int) -> Sums:
         """Return one run's sum and count of what has been logged since `logged` was called."""
-        return [(name, float(self.sums[name][run]), count) for name, count in self.counts.items()]
+        counts = self.counts + self.earlier[run]
+        return [(name, float(self.sums[name][run]), count) for name, count in counts.items()]
 
     def resume_logging(self, run: int, sums: Sums) -> None:
         """Put `unlogged` sums back."""
         for name, total, count in sums:
             self.sums.setdefault(name, torch.zeros(len(self.store.sizes), device=self.device))[run] = total
-            self.counts[name] = count
+            self.earlier[run][name] = count

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -63,10 +64,10 @@ def pick_device(device: str) -> str:
     """
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
-    device_type, _, index = device.partition(":")
-    if device_type not in ("cpu", "cuda") or (index and not index.isdigit()):
+    if not re.fullmatch(r"cpu|cuda(:[0-9]{1,4})?", device):
         raise OffbenchError(f"device must be auto, cpu, cuda or cuda:N, not {device!r}")
-    if device_type == "cuda" and (not torch.cuda.is_available() or int(index or 0) >= torch.cuda.device_count()):
+    index = device.partition(":")[2]
+    if device != "cpu" and (not torch.cuda.is_available() or int(index or 0) >= torch.cuda.device_count()):
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         raise OffbenchError(f"no device {device}: PyTorch {torch.__version__} sees {count} GPUs; use --device cpu")
     return device

@@ -182,12 +182,12 @@ def by_common_step(specs: Sequence[RunSpec]) -> list[list[RunSpec]]:
 
 
 def _check_environment(spec: RunSpec, data: Transitions) -> None:
-    """Refuse a run that was evaluated in another environment so far, such as one with other contact margins."""
+    """Refuse a run that was evaluated in another environment so far, or in none; contact margins make others."""
     before = spec.run.config().env_spec
-    if before is not None and data.env_spec is not None and not same_environment(before, data.env_spec):
+    if not same_environment(before, data.env_spec):
         raise OffbenchError(
-            f"{spec.folder} was evaluated in another environment than {spec.dataset} names now "
-            f"({before}, not {data.env_spec}); {TRAIN_ANEW}"
+            f"{spec.folder} was evaluated in another environment than it would be now "
+            f"({before or 'none'}, not {data.env_spec or 'none'}); give the same --env as before, or {TRAIN_ANEW}"
         )
 
 

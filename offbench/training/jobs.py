@@ -82,7 +82,7 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
 
     def __init__(self, jobs: Sequence[Job]) -> None:
         self.jobs, self.steps, self.notes = jobs, dict[int, int](), dict[int, str]()
-        self.titles = _titles(jobs)
+        self.titles, self.traces = _titles(jobs), {""}
         runs = sum(len(job.specs) for job in jobs)
         title = jobs[0].title if len(jobs) == 1 else f"{runs} runs"
         self.progress = Progress(sum(job.updates for job in jobs), title, work=sum(job.work for job in jobs))
@@ -121,6 +121,12 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
         work = sum(done * self.jobs[i].cost for i, done in done_of.items())
         self.progress.to(sum(done_of.values()), news, work)
 
+    def print_trace(self, trace: str) -> None:
+        """Print a traceback, once if several jobs fail at the same line."""
+        if trace not in self.traces:
+            self.progress.print_line(printable(trace.rstrip()))
+            self.traces.add(trace)
+
 
 def _train_here(job: Job, index: int, progress: JobProgress) -> list[str]:
     if job.deadline_passed:
@@ -131,6 +137,10 @@ def _train_here(job: Job, index: int, progress: JobProgress) -> list[str]:
         if len(progress.jobs) == 1:
             raise
         return [str(error)]
+    except Exception as error:
+        if len(progress.jobs) == 1:
+            raise
+        return [f"{job.title}: {describe_failure(error, progress.print_trace)}"]
 
 
 class _Pool(contextlib.AbstractContextManager["_Pool"]):
@@ -174,7 +184,6 @@ class _Pool(contextlib.AbstractContextManager["_Pool"]):
 
 def _train_in_processes(jobs: Sequence[Job], processes: int, pool: _Pool) -> Iterator[str]:
     waiting = collections.deque(enumerate(jobs))
-    traces = {""}
     while waiting or pool.active:
         while waiting and len(pool.active) < processes:
             index, job = waiting.popleft()
@@ -192,9 +201,7 @@ def _train_in_processes(jobs: Sequence[Job], processes: int, pool: _Pool) -> Ite
             if step is not None:
                 pool.progress.report(index, step, note)
                 continue
-            if note not in traces:  # all jobs may fail at the same line
-                pool.progress.progress.print_line(printable(note.rstrip()))
-                traces.add(note)
+            pool.progress.print_trace(note)
             yield from lines
             pool.end(receiver)
 

@@ -55,25 +55,20 @@ class Loggers(contextlib.AbstractContextManager["Loggers"]):
     def __init__(self, runs: Sequence[Run], destinations: Destinations) -> None:
         self.runs, self.destinations = list(runs), destinations
         self.sinks: list[list[TensorBoard | WandB]] = [[] for _ in runs]
+        self._closing = contextlib.ExitStack()  # closes all of them, also if one fails
 
     def __enter__(self) -> Loggers:
-        try:
+        with contextlib.ExitStack() as opened:
             for run, sinks in zip(self.runs, self.sinks, strict=True):
                 if self.destinations.tensorboard:
-                    sinks.append(TensorBoard(run))
+                    sinks.append(opened.enter_context(contextlib.closing(TensorBoard(run))))
                 if self.destinations.wandb is not None:
-                    sinks.append(WandB(run, self.destinations.wandb))
-        except BaseException:
-            self._close()  # those of the runs before
-            raise
+                    sinks.append(opened.enter_context(contextlib.closing(WandB(run, self.destinations.wandb))))
+            self._closing = opened.pop_all()
         return self
 
     def __exit__(self, exception_type: type[BaseException] | None, _: object, __: TracebackType | None) -> None:
-        self._close()
-
-    def _close(self) -> None:
-        for sink in (sink for sinks in self.sinks for sink in sinks):
-            sink.close()
+        self._closing.close()
 
     def write(self, index: int, losses: Losses, evaluations: Evaluations) -> None:
         """Show all rows of the run at `index`."""

@@ -338,7 +338,7 @@ class Run:
     def write_losses(self, rows: list[dict[str, float]]) -> None:
         """Replace losses.csv; a quantity that was not logged in a row stays empty."""
         columns = list(dict.fromkeys(key for row in rows for key in row))
-        lines = ([_short(row.get(key, "")) for key in columns] for row in rows)
+        lines = ([int(row[key]) if key == "step" else _short(row.get(key, "")) for key in columns] for row in rows)
         write_bytes(self.losses_path, csv_bytes(columns, lines))
 
     def losses(self) -> list[dict[str, float]]:

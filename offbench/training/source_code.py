@@ -174,6 +174,21 @@ def _tokens(source: str) -> Iterator[str]:
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node, clean=False):
             docstrings.add((node.body[0].lineno, node.body[0].col_offset))
+    lines = source.splitlines(keepends=True)
+    opened: list[tuple[int, int]] = []  # where the f-strings around a token begin
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type not in LEFT_OUT and token.start not in docstrings:
+        kind = tokenize.tok_name[token.type]
+        if kind.endswith("STRING_START"):
+            opened.append(token.start)
+        elif kind.endswith("STRING_END"):
+            start = opened.pop()
+            if not opened:  # the whole f-string as one token, as Python 3.11 reads it
+                yield _between(lines, start, token.end)
+        elif not opened and token.type not in LEFT_OUT and token.start not in docstrings:
             yield token.string if token.type != tokenize.NEWLINE else ""
+
+
+def _between(lines: Sequence[str], start: tuple[int, int], end: tuple[int, int]) -> str:
+    """Return the text between two positions (line from 1, column)."""
+    part = [*lines[start[0] - 1 : end[0] - 1], lines[end[0] - 1][: end[1]]]
+    return "".join([part[0][start[1] :], *part[1:]])

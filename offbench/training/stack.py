@@ -62,8 +62,7 @@ class Stack:
 
     def logged(self) -> list[dict[str, float]]:
         """Return each run's mean of everything logged since the last call."""
-        columns = self.program.logged()
-        return [{name: values[run] for name, values in columns.items()} for run in range(len(self.specs))]
+        return self.program.logged()
 
     def policy(self, run: int) -> Policy:
         """Return one run's policy as it is now, for the NumPy rollouts and the policy file."""
@@ -126,7 +125,7 @@ class Stack:
         names: dict[int, str] = {}
         for name, tensor in self.tensors().items():
             if tensor.dim():
-                bad = (~torch.isfinite(tensor)).flatten(2).any(2).any(0).nonzero()
+                bad = (~torch.isfinite(tensor)).transpose(0, 1).flatten(1).any(1).nonzero()
                 names |= {int(run): name for run in bad}
         return names
 

@@ -1,6 +1,7 @@
 """The training loop of a job: from the newest common checkpoint to its runs' last step.
 
-every eval_every steps:  checkpoint, then evaluate a snapshot on worker processes while training continues
+every eval_every steps:  checkpoint (less often if writing one takes long), then evaluate a snapshot on worker
+                         processes while training continues
 a deadline or Ctrl-C:    stops at the next chunk with a checkpoint; the same command resumes from it
 a run that diverges:     is marked and left out from there on; the other runs continue, as they share nothing with it
 """

@@ -91,8 +91,13 @@ def test_variants_with_one_label_on_other_datasets_are_one_method() -> None:
 
 def test_every_spelling_is_found() -> None:
     methods = named(("td3_bc", "default", None), ("bdb", "beta=0.5", 0.5), ("bdb", "default", "adaptive"))
-    for method in methods:
-        for name in method.spellings | {f"{method.label} (30,000 steps)", f"{method.label} (10 of 30,000 steps)"}:
+    spellings = [
+        ["td3_bc", "td3_bc/default", "td3_bc (30,000 steps)", "td3_bc (10 of 30,000 steps)"],
+        ["bdb/beta=0.5", "bdb (beta=0.5)", "bdb 0.5", "bdb/0.5", "bdb (beta=0.5) (30,000 steps)"],
+        ["bdb", "bdb/default", "bdb (adaptive)", "bdb adaptive", "bdb/adaptive", "bdb (adaptive) (30,000 steps)"],
+    ]
+    for method, names in zip(methods, spellings, strict=True):
+        for name in names:
             assert find_method(methods, name) == method
     assert find_method(methods, "bdb").variant == "default"
     with pytest.raises(OffbenchError, match=r"no method 'bdb/beta=0.51' here: did you mean 'bdb \(beta=0.5\)'"):

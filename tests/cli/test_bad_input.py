@@ -74,6 +74,7 @@ CASES: dict[str, tuple[str, str]] = {
     "train bdb --dataset MEDIUM --eval-every x": ("'x' is not a whole number from 1", ""),
     "train bdb --dataset MEDIUM --device cuda": ("no device cuda: PyTorch", "--device cpu"),
     "train bdb --dataset MEDIUM --device tpu": ("device must be auto, cpu, cuda or cuda:N, not 'tpu'", ""),
+    "train bdb --dataset MEDIUM --device cpu:0": ("device must be auto, cpu, cuda or cuda:N, not 'cpu:0'", ""),
     "train td3_bc --dataset MEDIUM --beta 0.5": (
         "unrecognized arguments: --beta (see",
         "`offbench train td3_bc --help`",

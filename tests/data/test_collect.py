@@ -78,8 +78,9 @@ def test_the_fractions_that_are_named_are_recorded(
     ladder_at: Callable[[dict[str, float]], tuple[str, Path]],
 ) -> None:
     recipe, folder = ladder_at({"medium": 0.36, "a": 0.72, "expert": 1.0})
-    for level in ("0.36", "0.72", "0.75"):
-        offbench.collect(recipe, level, steps=200, behaviour_dir=folder, workers=1)
+    for level, fraction in {"0.36": 0.36, "0.72": 0.72, "0.75": 0.72}.items():
+        name = offbench.collect(recipe, level, steps=200, behaviour_dir=folder, workers=1)
+        assert metadata_of(name)["offbench"]["parts"][0]["fraction"] == fraction
 
 
 @pytest.mark.parametrize(("fraction", "refused"), [(0.14, True), (0.25, False), (0.65, True)])

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import pickle
+import shutil
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,14 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import offbench
 from offbench.agents.sb3_zip import read_sb3_zip
 from offbench.common.errors import OffbenchError
 from offbench.data import minari_store
+from tests.conftest import forget_modules
 
 ENV = "InvertedPendulum-v5"
 LOW, HIGH = np.array([-3], np.float32), np.array([3], np.float32)
@@ -28,7 +31,7 @@ AGENTS: dict[str, tuple[Any, dict[str, Any], dict[str, Any]]] = {
     "sac": (SAC, {"net_arch": [8, 6]}, {"buffer_size": 10}),
     "td3": (TD3, {"net_arch": [8]}, {"buffer_size": 10}),
     "ddpg": (DDPG, {"net_arch": [8], "activation_fn": torch.nn.Tanh}, {"buffer_size": 10}),
-    "ppo": (PPO, {"net_arch": [8, 6]}, {}),
+    "ppo": (PPO, {"net_arch": [8, 6], "log_std_init": -1.0}, {}),
     "a2c": (A2C, {"net_arch": {"pi": [5], "vf": [7]}, "activation_fn": torch.nn.ReLU}, {}),
 }
 
@@ -50,7 +53,7 @@ def test_a_zips_policy_acts_as_in_sb3(name: str, home: Path, rng: np.random.Gene
     np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
     if name in ("ppo", "a2c"):  # the std, by the log-density of the mode
         spread = (policy(observations, rng) - policy(observations)).std()
-        assert 0.5 < spread < 1.5  # log_std is 0 before training
+        assert spread == pytest.approx(np.exp(-1) if name == "ppo" else 1, rel=0.4)  # log_std before training
     policy.save(home / "policy.safetensors")
     np.testing.assert_array_equal(
         offbench.load_policy(home / "policy.safetensors")(observations), policy(observations)
@@ -114,6 +117,33 @@ def test_an_agent_of_another_environment_is_refused(home: Path, tiny: tuple[str,
     assert minari_store.local_ids() == []
 
 
+class Halved(FlattenExtractor):
+    """Has no weights, and the observations' width."""
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return super().forward(observations) / 2
+
+
+class Linear(FlattenExtractor):
+    """Has weights."""
+
+    def __init__(self, space: gym.Space[Any]) -> None:
+        super().__init__(space)
+        self.layer = torch.nn.Linear(4, 4)
+
+
+@pytest.mark.parametrize("extractor", [Halved, Linear])
+@pytest.mark.parametrize("cls", [PPO, SAC])
+def test_an_extractor_of_ones_own_is_refused(cls: Any, extractor: Any, home: Path) -> None:
+    kwargs = {"features_extractor_class": extractor}
+    cls("MlpPolicy", gym.make(ENV), policy_kwargs=kwargs, device="cpu").save(home / "agent.zip")
+    with pytest.raises(OffbenchError, match=r"agent\.zip has a features extractor of its own"):
+        read_sb3_zip(home / "agent.zip", LOW, HIGH, ENV)
+    kwargs = {"features_extractor_class": FlattenExtractor}
+    cls("MlpPolicy", gym.make(ENV), policy_kwargs=kwargs, device="cpu").save(home / "plain.zip")
+    read_sb3_zip(home / "plain.zip", LOW, HIGH, ENV)
+
+
 def test_what_is_recorded_is_what_the_policy_does(home: Path, tiny: tuple[str, str]) -> None:
     recipe, behaviour_dir = tiny
     _, path = saved("td3", home)
@@ -154,3 +184,40 @@ def test_a_function_of_ones_own(home: Path, tiny: tuple[str, str], monkeypatch: 
             offbench.collect(recipe, policy=name, name="bad", **more)
     with pytest.raises(OffbenchError, match="'medium' is a level of offbench's own agents"):
         offbench.collect(recipe, policy="my_policy_module:act", name="medium", **more)
+
+
+POLICIES = """
+import functools
+
+import torch
+
+
+@torch.no_grad()
+def decorated(o):
+    return [GAIN * o[1]]
+
+
+class Acting:
+    def __call__(self, o):
+        return decorated(o)
+
+
+called = Acting()
+partial = functools.partial(lambda o, gain: [gain * o[1]], gain=GAIN)
+"""
+
+
+@pytest.mark.parametrize("name", ["decorated", "called", "partial"])
+def test_an_edit_of_a_policys_module_is_noticed(
+    name: str, home: Path, tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(home))
+    hashes = []
+    for gain in ("0.5", "0.25"):
+        forget_modules(home)
+        shutil.rmtree(home / "__pycache__", ignore_errors=True)
+        (home / "edited_policies.py").write_text(POLICIES.replace("GAIN", gain))
+        more: dict[str, Any] = {"behaviour_dir": tiny[1], "workers": 1, "steps": 20, "overwrite": gain == "0.25"}
+        dataset = offbench.collect(tiny[0], policy=f"edited_policies:{name}", name="edited", **more)
+        hashes.append(minari_store.read_metadata(dataset)["offbench"]["parts"][0]["policy_sha256"])
+    assert hashes[0] != hashes[1]

@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 import h5py
+import minari
 import numpy as np
 import pytest
 
@@ -143,6 +144,7 @@ def test_medium_replay_of_some_environments(tiny: tuple[str, str], home: Path) -
     shutil.copytree(Path(tiny[1]), home / "behaviour", ignore=shutil.ignore_patterns("ladder"))
     (home / "tiny.toml").write_text("replay_envs = 1\n" + Path(tiny[0]).read_text())
     ladder = offbench.behaviour("./tiny.toml", behaviour_dir=home / "behaviour", workers=1)
+    assert ladder.info.command.startswith("offbench behaviour ./tiny.toml --seed 0")
     name = offbench.collect("./tiny.toml", "medium-replay", behaviour_dir=home / "behaviour")
     rewards = [
         np.load(home / "behaviour" / "tiny" / "seed-0" / "transitions" / f"{end:09d}.npz")["rewards"][:, 0]
@@ -279,16 +281,49 @@ def test_environments_that_reuse_their_array_are_recorded_right() -> None:
         def __init__(self) -> None:
             self.state = np.zeros(1)
             self.observation_space = gym.spaces.Box(0, 3, (1,), np.float64)
+            self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
 
         def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
             self.state[:] = 0
             return self.state, {}
 
-        def step(self, _: Any) -> Any:
+        def step(self, action: Any) -> Any:
+            action *= 10
             self.state += 1
             return self.state, 0.0, bool(self.state[0] == 3), False, {}
 
     policy = uniform(np.full(1, -1, np.float32), np.full(1, 1, np.float32), 1, "X-v0")
     lane = _RunningEpisode(Reusing(), policy, Task("", b"", 0, (), (0,), False), 0)
-    episode = next(e for e in (lane.step(np.zeros(1, np.float32)) for _ in range(9)) if e)
+    episode = next(e for e in (lane.step(np.full(1, 0.5, np.float32)) for _ in range(9)) if e)
     np.testing.assert_array_equal(episode.observations[:, 0], [0, 1, 2, 3])
+    np.testing.assert_array_equal(episode.actions[:, 0], [0.5, 0.5, 0.5])
+
+
+DOUBLE = """
+import gymnasium as gym
+import numpy as np
+
+
+class Double(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float64)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, 2), {}
+
+    def step(self, action):
+        return np.tanh(np.full(2, action[0])), float(action[0]), False, False, {}
+
+
+gym.register("Double-v0", "double:Double", max_episode_steps=20)
+"""
+
+
+def test_actions_are_recorded_in_the_precision_of_their_space(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (home / "double.py").write_text(DOUBLE)
+    (home / "double.toml").write_text('env_id = "double:Double-v0"\n')
+    monkeypatch.syspath_prepend(str(home))
+    name = offbench.collect("./double.toml", "random", steps=100, workers=1)
+    assert next(minari.load_dataset(name).iterate_episodes()).actions.dtype == np.float64
+    assert offbench.verify(name, workers=1).ok

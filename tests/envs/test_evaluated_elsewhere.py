@@ -77,3 +77,19 @@ def test_another_environment_is_another_run(pendulum: str, tmp_path: Path) -> No
         offbench.train("bc", pendulum, env=str(tmp_path / "short.toml"), **SMALL | {"steps": 6})
     with pytest.raises(OffbenchError, match=r"has observations \(4,\).*--env RECIPE"):
         offbench.train("bc", pendulum, env="hopper", runs=tmp_path / "other", **SMALL)
+
+
+def test_a_run_stays_with_its_environment_or_without_one(pendulum: str, home: Path) -> None:
+    change(pendulum, env_spec=None, eval_env_spec=None)
+    longer = SMALL | {"steps": 6}
+    offbench.train("bc", pendulum, **SMALL)
+    with pytest.raises(
+        OffbenchError, match=r"evaluated in another environment .*\(none, not .*the same --env as before"
+    ):
+        offbench.train("bc", pendulum, env="inverted-pendulum", **longer)
+    offbench.train("bc", pendulum, **longer)
+    offbench.train("bc", pendulum, env="inverted-pendulum", runs="evaluated", **SMALL)
+    with pytest.raises(OffbenchError, match=r"evaluated in another environment .*, not none\)"):
+        offbench.train("bc", pendulum, runs="evaluated", **longer)
+    (run,) = offbench.train("bc", pendulum, env="inverted-pendulum", runs="evaluated", **longer)
+    assert sorted(Run(run).evaluations()) == [2, 4, 6]

@@ -131,6 +131,7 @@ def test_tasks_and_methods_in_the_papers_order(home: Path) -> None:
         ("mujoco/walker2d/medium-expert-v0", ("walker2d", "medium-expert")),
         ("inverted-pendulum-medium-v3", ("inverted-pendulum", "medium")),
         ("hopper-60percent-v0", ("hopper", "60percent")),
+        ("hopper-12p5percent-v0", ("hopper", "12p5percent")),
         ("mujoco/hopper/expert-v0", ("hopper", "expert")),
         ("my-data-v0", ("my-data", "")),
     ],

@@ -28,7 +28,16 @@ from offbench.data import minari_store
 from offbench.data.collect import cut_at
 from offbench.envs.environments import env_spec, make_env
 from offbench.rollouts.policy import uniform
-from offbench.rollouts.rollouts import PARALLEL_EPISODES, Episode, Rollouts, Task, gathered, play
+from offbench.rollouts.rollouts import (
+    PARALLEL_EPISODES,
+    Episode,
+    EpisodeStats,
+    Rollouts,
+    Task,
+    gathered,
+    play,
+    summary,
+)
 
 SUMS_MARGINS = tuple(map(int, mujoco.__version__.split(".")[:2])) >= (3, 5)
 POLE = env_spec("InvertedPendulum-v5")
@@ -250,3 +259,10 @@ def _children(pid: int) -> list[int]:
 def _alive(pid: int) -> bool:
     status = Path(f"/proc/{pid}/status")
     return status.exists() and "State:\tZ" not in status.read_text()
+
+
+def test_small_returns_keep_their_digits() -> None:
+    """References of an environment whose rewards are tiny; those of others have four decimals."""
+    small = summary([EpisodeStats(1.23456e-5, 3), EpisodeStats(1.23456e-5, 4)])
+    assert small == {"return": 1.2346e-5, "low": 1.2346e-5, "high": 1.2346e-5, "length": 3.5}
+    assert summary([EpisodeStats(3421.123456, 3), EpisodeStats(3421.123456, 3)])["return"] == 3421.1235

@@ -196,6 +196,19 @@ def test_a_refusal_at_the_second_run_closes_the_first(
     assert fake_wandb[0].finished
 
 
+def test_a_run_that_does_not_close_leaves_no_other_open(
+    fake_wandb: list[FakeRun], home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(loggers.TensorBoard, "close", full)
+    runs = [made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", seed, 50) for seed in range(2)]
+    with pytest.raises(OSError, match="disk full"), Loggers(runs, Destinations(tensorboard=True, wandb="project")):
+        pass
+    assert [run.finished for run in fake_wandb] == [True, True]
+
+
 @pytest.mark.parametrize("name", ["tensorboard", "wandb"])
 def test_a_run_whose_folder_of_events_is_a_link(name: str, home: Path, fake_wandb: list[FakeRun]) -> None:
     """In a run that was handed over it may lead anywhere."""

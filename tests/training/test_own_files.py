@@ -153,6 +153,16 @@ def test_an_error_shows_the_users_line(seeds: str, home: Path, capfd: pytest.Cap
     assert "an error in awac: ValueError: oh" in said
 
 
+def test_an_error_in_one_job_does_not_stop_the_next(home: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """On a GPU and with one worker, all jobs are trained in one process."""
+    (home / "awac.py").write_text(EXAMPLE.replace("self.critic.minimize(critic_loss)", "raise ValueError('oh')"))
+    with pytest.raises(SystemExit):
+        main(["train", "awac.py", *WORDS, "--steps", "20", "--seeds", "0:3", "--stack", "1", "--workers", "1"])
+    said = capfd.readouterr().err
+    assert said.splitlines()[-1].endswith("see the traceback above (and 2 more)")
+    assert said.count("Traceback") == 1
+
+
 def test_an_edit_is_noticed_and_a_comment_is_none(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = home / "awac.py"
     file.write_text(EXAMPLE)
@@ -367,3 +377,20 @@ def test_tables_mark_a_cell_of_different_code(home: Path, capsys: pytest.Capture
             main([*words, "--runs", str(home / str(number))])
             said = "note: the runs of bdb" in (text := capsys.readouterr().out)
             assert said == ("trained by different code" in text) == bool(number)
+
+
+F_STRINGS = """
+def update(x, width):
+    '''Docstrings do not count.'''
+    print(f"{x!r:>{width}} {{}}", rf'\\{x:{width}.3}' "plain")  # nor comments
+    return f'''{x + 1
+    } and {f"{x}"}'''
+"""
+
+
+def test_the_hash_of_f_strings_is_the_same_in_all_versions_of_python() -> None:
+    """Python 3.12 and later split f-strings into tokens. The hash is of the tokens that Python 3.11 makes of it."""
+    tokens = ["def", "update", "(", "x", ",", "width", ")", ":", "", "    ", ""]
+    tokens += ["print", "(", 'f"{x!r:>{width}} {{}}"', ",", r"rf'\{x:{width}.3}'", '"plain"', ")", ""]
+    tokens += ["return", "f'''{x + 1\n    } and {f\"{x}\"}'''", "", ""]
+    assert list(source_code._tokens(F_STRINGS)) == tokens

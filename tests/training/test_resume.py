@@ -301,3 +301,14 @@ main(["train", "td3_bc", "--dataset", {medium!r}, "--steps", "200", "--eval-ever
     assert found.returncode == 2
     assert f"is being trained by process {os.getpid()} on {socket.gethostname()}" in found.stderr
     assert run.config().steps == 100  # who was refused has changed nothing
+
+
+def test_the_steps_of_losses_stay_whole(home: Path) -> None:
+    """A resume writes the rows anew that it has read: 1000998 is not 1.001e+06."""
+    run, steps = Run(home), [999_999, 1_000_000, 1_000_998, 1_001_000, 12_345_678]
+    run.write_losses([{"step": step, "q_abs": step / 3} for step in steps])
+    text = run.losses_path.read_text()
+    assert text.splitlines()[3] == "1000998,333666"
+    run.write_losses(run.losses())
+    assert run.losses_path.read_text() == text
+    assert [row["step"] for row in run.losses()] == steps

@@ -176,3 +176,30 @@ def test_data_without_an_environment_are_trained_on_and_that_is_said(
     assert "house-v0 names no environment" in err
     assert "normalize" not in out
     assert "next: offbench evaluate runs/house-v0/bc/hidden=8x8/seed-0 --env" in err
+
+
+def test_each_run_of_a_stack_has_the_mean_of_its_own_updates(medium: str) -> None:
+    """One run was stopped at step 100, between two rows of losses.csv; the training of the other ended there."""
+
+    def train(folder: str, together: bool) -> list[Path]:
+        stopped, other = specs(medium, folder, 2, (400, 400))
+        finish([replace(job, deadline=0.0) for job in jobs_of([stopped], 1)])
+        finish(jobs_of([replace(other, steps=100)], 1))
+        for group in [[stopped, other]] if together else [[stopped], [other]]:
+            finish(jobs_of(group, 1))
+        return [spec.run.losses_path for spec in (stopped, other)]
+
+    for one, alone in zip(train("stack", True), train("alone", False), strict=True):
+        assert one.read_bytes() == alone.read_bytes()
+        assert [row["step"] for row in Run(one.parent).losses()][-1] == 400
+
+
+def test_an_ensemble_of_numbers_is_checked_for_nan(medium: str) -> None:
+    """A learned part may have tensors [ensemble, runs], without further axes."""
+    from offbench.training.grouping import load_datasets
+    from offbench.training.stack import Stack
+
+    stack_specs = specs(medium, "runs", 2, (10, 10))
+    stack = Stack(load_algorithm("bdb"), stack_specs, load_datasets(stack_specs), "cpu")
+    stack.tensors = lambda: {"actor.scale": torch.tensor([[1.0, 2.0], [3.0, float("nan")]])}  # type: ignore[method-assign]
+    assert stack.diverged() == {1: "actor.scale"}
