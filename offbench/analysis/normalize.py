@@ -124,6 +124,7 @@ def normalize(runs: str | Path = "runs", *, env: str | None = None, returns: Seq
 
     Rows are dictionaries; `offbench.analysis.normalize.render(rows, "markdown")` prints them.
     """
+    returns = list(returns)
     if env is None:
         if returns:
             raise OffbenchError("returns need their environment: give --env, e.g. --env hopper 1234.5")

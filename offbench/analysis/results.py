@@ -10,7 +10,6 @@ Everything is read from the run directories alone.
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase as fnmatch
@@ -26,7 +25,7 @@ from offbench.common.files import READ_REMEDIES
 from offbench.common.scores import SCORED_EVALUATIONS, Evaluations, mean_std, normalize, run_return, window
 from offbench.common.terminal import warn
 from offbench.common.text import from_to, plural
-from offbench.data.levels import FRACTION, LEVELS
+from offbench.data.levels import LEVELS, env_and_level
 from offbench.envs.environments import same_environment
 from offbench.training.run import DIGITS, Run, RunConfig, find_runs
 
@@ -61,9 +60,7 @@ class Task:
     @property
     def env_and_level(self) -> tuple[str, str]:
         """(environment, level), read from the dataset id; the level is "" if the id has none."""
-        stem = re.sub(r"-v\d+$", "", self.dataset)
-        match = re.fullmatch(rf"(.+?)[-/]({'|'.join(sorted(LEVELS, key=len, reverse=True))}|{FRACTION})", stem)
-        return (match[1].split("/")[-1], match[2]) if match else (stem, "")
+        return env_and_level(self.dataset)
 
 
 @dataclass(frozen=True)
@@ -230,21 +227,13 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
     """
     roots = tuple(map(Path, [runs] if isinstance(runs, str | Path) else runs))
     unique = {run.folder.resolve(): run for root in roots for run in find_runs(root)}
-    entries, unevaluated = entries_of(unique.values())
+    entries, unevaluated = entries_of(unique.values(), datasets)
     if not entries:
         below = ", ".join(map(str, roots))
         missing = "" if any(root.exists() for root in roots) else " (no such folder)"
         raise OffbenchError(
             f"no evaluated runs below {below}{missing}; start one with `offbench train ALGO --dataset ID`"
         )
-    for pattern in datasets:
-        if not any(fnmatch(entry.task.dataset, pattern) for entry in entries):
-            raise unknown("dataset", pattern, {entry.task.dataset for entry in entries})
-    if datasets:
-        entries = [e for e in entries if any(fnmatch(e.task.dataset, pattern) for pattern in datasets)]
-        unevaluated = [
-            run for run in unevaluated if any(fnmatch(run.config().dataset, pattern) for pattern in datasets)
-        ]
     if methods:
         every = tuple(dict.fromkeys(entry.method for entry in entries))
         wanted = {find_method(every, name) for name in methods}
@@ -275,13 +264,20 @@ def window_text(runs: Iterable[EvaluatedRun]) -> str:
     return f"{from_to(counts)} {plural(max(counts), 'evaluation')}, {plural(len(ends), 'step')} {from_to(ends)}"
 
 
-def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
+def entries_of(
+    runs: Iterable[Run], datasets: Sequence[str] = (), *, compared: bool = True
+) -> tuple[list[Entry], list[Run]]:
     """Return runs as entries in the order of the paper's table, and the runs that have no evaluation yet.
 
     Damaged runs are named on stderr and left out.
 
+    Args:
+        datasets: only these, by id or by a pattern; all if empty.
+        compared: whether the runs are compared, so that those on the same data must have been evaluated alike.
+
     Raises:
-        OffbenchError: one is there twice, two do not compare, or none but damaged ones is evaluated.
+        OffbenchError: one is there twice, two do not compare, none but damaged ones is evaluated, or there is no such
+            dataset.
     """
     groups: dict[tuple[str, str, str, str], list[EvaluatedRun]] = {}
     unevaluated = []
@@ -306,6 +302,15 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
         raise damaged[0]
     for reason in damaged:
         warn(f"left out: {reason}")
+    if groups and datasets:
+        ids = {dataset for dataset, *_ in groups}
+        for pattern in datasets:
+            if not any(fnmatch(dataset, pattern) for dataset in ids):
+                raise unknown("dataset", pattern, ids)
+        groups = {key: group for key, group in groups.items() if any(fnmatch(key[0], p) for p in datasets)}
+        unevaluated = [run for run in unevaluated if any(fnmatch(run.config().dataset, p) for p in datasets)]
+    if compared:
+        _check_evaluated_alike(groups)
     tasks = _tasks(groups)
     configs: dict[tuple[str, str], list[RunConfig]] = {}
     for (_, _, algorithm, variant), group in groups.items():
@@ -322,21 +327,33 @@ def entries_of(runs: Iterable[Run]) -> tuple[list[Entry], list[Run]]:
 
 def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[EvaluatedRun]]) -> dict[tuple[str, str], Task]:
     """Return the task of each (dataset, content), with a reference that all its runs have."""
-    runs: dict[tuple[str, str], list[EvaluatedRun]] = {}
-    for key, group in groups.items():
-        runs.setdefault(key[:2], []).extend(group)
+    runs = _by_data(groups)
     ids = [dataset for dataset, _ in runs]
     tasks = {}
     for (dataset, content), group in runs.items():
-        kinds = {(t.config.env_spec, *t.config.references.items()): t for t in group}
-        for one, other in itertools.combinations(kinds.values(), 2):
-            _check_evaluated_alike(one, other)
         references = [name for name in ("dataset", "d4rl") if all(t.config.references.get(name) for t in group)]
         tasks[dataset, content] = Task(dataset, content, references[0] if references else None, ids.count(dataset) > 1)
     return tasks
 
 
-def _check_evaluated_alike(one: EvaluatedRun, other: EvaluatedRun) -> None:
+def _by_data(
+    groups: Mapping[tuple[str, str, str, str], Sequence[EvaluatedRun]],
+) -> dict[tuple[str, str], list[EvaluatedRun]]:
+    """Return the runs of each (dataset, content)."""
+    runs: dict[tuple[str, str], list[EvaluatedRun]] = {}
+    for key, group in groups.items():
+        runs.setdefault(key[:2], []).extend(group)
+    return runs
+
+
+def _check_evaluated_alike(groups: Mapping[tuple[str, str, str, str], Sequence[EvaluatedRun]]) -> None:
+    for group in _by_data(groups).values():
+        kinds = {(t.config.env_spec, *t.config.references.items()): t for t in group}
+        for one, other in itertools.combinations(kinds.values(), 2):
+            _check_pair(one, other)
+
+
+def _check_pair(one: EvaluatedRun, other: EvaluatedRun) -> None:
     """Refuse two runs on the same data whose returns, or scores, do not compare."""
     a, b = one.config, other.config
     if a.env_spec and b.env_spec and not same_environment(a.env_spec, b.env_spec):

@@ -27,7 +27,7 @@ from offbench.common.files import JsonObject, damage, read_text
 from offbench.common.settings import build, short_repr
 from offbench.common.text import LARGEST_INTEGER, MOST_SEEDS
 from offbench.data import minari_store
-from offbench.data.levels import parse_level, recipe_and_level
+from offbench.data.levels import env_and_level, level_argument, parse_level, recipe_and_level
 from offbench.envs.recipes import load_recipe
 from offbench.training.spec import Times
 
@@ -130,20 +130,39 @@ def _times(values: JsonObject, default: Times, where: str) -> Times:
 
 
 def _source(value: object, folder: Path, where: str) -> Source:
-    """Return a dataset from its id (a shipped recipe's level) or from a table; `folder` is the grid's."""
-    if isinstance(value, dict):
-        source = build(Source, value, f"{where}: datasets")
-        parse_level(source.level or "medium")
-        minari_store.check_id(source.id)
+    """Return a dataset from its id or a table, which may leave out what the id names; `folder` is the grid's."""
+    if not isinstance(value, dict | str):
+        raise OffbenchError(f"{where}: datasets must be ids or tables, not {short_repr(value)}")
+    source = build(Source, {"id": value} if isinstance(value, str) else value, f"{where}: datasets")
+    minari_store.check_id(source.id)
+    named = level_argument(env_and_level(source.id)[1])
+    if source.env:
         beside = folder / source.env
         env = str(beside) if source.env.endswith(".toml") and beside.is_file() else source.env
-        return dataclasses.replace(source, env=env, level=source.level or ("medium" if env else ""))
-    if not isinstance(value, str):
-        raise OffbenchError(f"{where}: datasets must be ids or tables, not {short_repr(value)}")
-    env, level = recipe_and_level(minari_store.check_id(value))
-    if env and value.rpartition("-v")[2] != str(load_recipe(env).version):
-        return Source(value)  # of another version, such as one of D4RL's: it can be used but not recorded
-    return Source(value, env, level)
+        level = source.level or named or "medium"
+    else:
+        env, level = _recipe_of(source.id)
+        level = source.level or level
+    if not env and source != Source(source.id):
+        raise OffbenchError(f"{where}: {source.id} needs env, the recipe to record it with")
+    if level:
+        name, _ = parse_level(level)
+        if named and name != parse_level(named)[0]:
+            raise OffbenchError(f"{where}: {source.id} is not at level {level}; give it another id")
+    return dataclasses.replace(source, env=env, level=level)
+
+
+def _recipe_of(dataset_id: str) -> tuple[str, str]:
+    """Return the shipped recipe and the level that an id names, ("", "") if there is none.
+
+    Datasets of another version (such as D4RL's), blends and policies of one's own can be used but not recorded.
+    """
+    env, level = recipe_and_level(dataset_id)
+    if env and dataset_id.rpartition("-v")[2] != str(load_recipe(env).version):
+        return "", ""
+    if minari_store.exists(dataset_id) and not env_and_level(dataset_id)[1]:
+        return "", ""
+    return env, level
 
 
 def _entry(value: object, times: Times, ids: Sequence[str], folder: Path, where: str) -> Entry:

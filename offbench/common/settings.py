@@ -16,6 +16,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
+import numpy as np
+
 from offbench.common.errors import DamagedError, OffbenchError, unknown
 from offbench.common.text import LARGEST_INTEGER, whole_number
 
@@ -186,6 +188,8 @@ def _convert(value: object, hint: Any, parse: bool) -> Any:
 def _convert_one(value: object, option: Any, parse: bool) -> Any:
     if option is Any:
         return value
+    if isinstance(value, np.generic):
+        value = value.item()
     if typing.get_origin(option) is tuple:
         items = typing.get_args(option)
         parts = re.split("[,x]", value) if isinstance(value, str) and parse else value  # 64x64 as folders are named

@@ -113,6 +113,11 @@ def collect(
     trained = ladder is not None or all(part.source in WITHOUT_AGENT for part in parts)
     prepared = prepare(ladder) if trained else None
     if prepared and not overwrite and minari_store.exists(dataset_id) and _is_same(dataset_id, prepared[-1]):
+        if prepared[0].calls_function:
+            raise OffbenchError(
+                f"{dataset_id} is recorded already, and whether {policy} still acts as it did then cannot be told; "
+                "--overwrite records it again, --name records another dataset"
+            )
         minari_store.tidy(dataset_id)
         inform(f"{dataset_id} is recorded already, from the same policies and seed")
         return dataset_id
@@ -196,6 +201,11 @@ class _Recording:
             )
 
     @property
+    def calls_function(self) -> bool:
+        """Whether the policy is a user's own function, which may keep a state, draw numbers and read files."""
+        return self.own_policy is not None and isinstance(self.own_policy.policy, FunctionPolicy)
+
+    @property
     def ladder(self) -> Ladder:
         """The behaviour agent's ladder."""
         assert self._ladder is not None
@@ -264,8 +274,9 @@ class _Recording:
             expected = self.ladder.info.medium_replay.sha256
             yield from cut_at(load_replay(self.ladder.replay, expected, self.observation_space, *self.bounds), count)
             return
+        workers = 0 if self.calls_function else self.workers  # copies of a function would draw the same numbers
         with (
-            Rollouts(self.spec, self.workers) as rollouts,
+            Rollouts(self.spec, workers) as rollouts,
             # the part is in the seed, so that both halves of medium-expert have their own episodes
             contextlib.closing(
                 rollouts.episodes(self.policy(rung), self.seed, (index,), transitions_needed=count)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 from offbench.common.errors import OffbenchError, unknown
@@ -50,17 +51,24 @@ def parse_level(text: str) -> tuple[str, tuple[Part, ...]]:
     return f"{_percent(fraction)}percent", (Part(str(fraction)),)
 
 
+def env_and_level(dataset_id: str) -> tuple[str, str]:
+    """Return the (environment, level) that an id such as `ns/hopper-60percent-v0` names, else (the id, "")."""
+    stem = re.sub(r"-v\d+$", "", dataset_id)
+    match = re.fullmatch(rf"(.+?)[-/]({'|'.join(sorted(LEVELS, key=len, reverse=True))}|{FRACTION})", stem)
+    return (match[1].split("/")[-1], match[2]) if match else (stem, "")
+
+
 def recipe_and_level(dataset_id: str) -> tuple[str, str]:
     """Return the shipped recipe and the `--level` that an id such as `hopper-60percent-v0` names, else ("", "")."""
     body = dataset_id.rpartition("-v")[0]
     for env in sorted(names(), key=len, reverse=True):
         level = body.removeprefix(f"{env}-")
         if level != body:
-            return env, _level(level)
+            return env, level_argument(level)
     return "", ""
 
 
-def _level(name: str) -> str:
+def level_argument(name: str) -> str:
     """Return what `--level` takes for a level's name in an id: 60percent is 0.6."""
     if name.endswith("percent"):
         try:

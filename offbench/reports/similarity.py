@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 from offbench.analysis.methods import Method
@@ -19,6 +20,7 @@ def similarity_tables(results: Results) -> list[Table]:
     paper = {(r["env"], r["level"], r["method"]): r["similar_score_percent"] for r in published("similarity")}
     similar = {key: values for key, entry in results.entries.items() if (values := _similar(entry))}
     methods = [method for method in results.methods if any(key[1] == method for key in similar)]
+    tolerances = {(v.tolerance, v.action_tolerance) for values in similar.values() for v in values}
     rows, details = [], []
     for task in results.tasks:
         env, level = task.env_and_level
@@ -27,11 +29,20 @@ def similarity_tables(results: Results) -> list[Table]:
             if (task, method) not in similar:
                 cells.append(EMPTY)
                 continue
-            values = similar[task, method]
-            by_q, by_action = (mean_std([getattr(v, key) for v in values]) for key in ("q_similar", "action_similar"))
             number = paper.get((env, level, _similar_name(method)))
-            cells.append(Cell(plus_minus(by_q), by_q[0], f"paper {number}" if number else ""))
-            details.append([*row_name(results, task), *_similar_row(method, values, by_q, by_action, number)])
+            below = [f"paper {number}"] if number else []
+            alike: dict[tuple[float, float], list[Similarity]] = {}
+            for value in similar[task, method]:
+                alike.setdefault((value.tolerance, value.action_tolerance), []).append(value)
+            if len(tolerances) > 1:
+                below.append(f"tolerance {' and '.join(f'{q:g}' for q, _ in sorted(alike))}")
+            for values in alike.values():
+                by_q, by_action = (
+                    mean_std([getattr(v, key) for v in values]) for key in ("q_similar", "action_similar")
+                )
+                details.append([*row_name(results, task), *_similar_row(method, values, by_q, by_action, number)])
+            mean = Cell(plus_minus(by_q), by_q[0]) if len(alike) == 1 else Cell("-")
+            cells.append(dataclasses.replace(mean, below=", ".join(below)))
         if any(cell is not EMPTY for cell in cells):
             rows.append([*row_name(results, task), *cells])
     if not rows:
@@ -43,6 +54,10 @@ def similarity_tables(results: Results) -> list[Table]:
         "formula; this reading of its Table 2 is ours."
         + (" “paper”: its printed number, on D4RL's v0 datasets." if has_paper_numbers else "")
     ]
+    if len(tolerances) > 1:
+        notes.append(
+            "The runs' tolerances differ. Scores of different tolerances do not compare, and are not averaged."
+        )
     header = ["level", "environment", *[method.label for method in methods]]
     columns = ["level", "environment", "method", "by Q (%)", "by action (%)", "paper (%)", "seeds", "step", "samples"]
     title = "Similar score (the BDB paper's Table 2)" if is_papers_grid(results) else "Similar score"

@@ -86,7 +86,7 @@ def _runs(root: str | Path) -> list[JsonObject]:
 
     if Path(root).exists() and not Path(root).is_dir():
         raise OffbenchError(f"{root} is not a folder of runs")
-    entries, unevaluated = entries_of(find_runs(Path(root)))
+    entries, unevaluated = entries_of(find_runs(Path(root)), compared=False)
     rows = [
         _run(entry.task.name, entry.method.label, trained.run, trained.config, trained)
         for entry in entries

@@ -33,6 +33,12 @@ OWN_VARIABLE = "OFFBENCH_OWN_ALGORITHMS"  # {name: "module:class"} as JSON, for 
 _own: dict[str, type[Algorithm]] = {}  # this process's own algorithms
 
 
+# options of `train`, its Python function and the entries of a grid, which settings must not be named as
+RESERVED_SETTINGS = {
+    *("algorithm", "command", "dataset", "datasets", "device", "download", "env", "eval_episodes", "eval_every"),
+    *("fresh", "help", "label", "name", "precision", "runs", "seeds", "stack", "steps", "tensorboard", "wandb"),
+    "workers",
+}
 REQUIRED_SETTINGS = ("batch_size", "normalize")  # settings that the training itself reads
 # Settings of earlier versions, each with the value that has no effect. bdb_plus has some of bdb's
 # now; the others lowered the scores and were removed (docs/results.md).
@@ -231,6 +237,11 @@ def _check_algorithm(cls: type, what: str) -> type[Algorithm]:
     for needed in REQUIRED_SETTINGS:
         if needed not in {field.name for field in dataclasses.fields(config)}:
             raise OffbenchError(f"{what}: its Config lacks the setting {needed}")
+    for field in dataclasses.fields(config):
+        if field.name in RESERVED_SETTINGS:
+            raise OffbenchError(f"{what}: the setting {field.name} has the name of an option of training; rename it")
+        if field.init and field.default is field.default_factory is dataclasses.MISSING:
+            raise OffbenchError(f"{what}: the setting {field.name} needs a default")
     if config.__hash__ is None:
         raise OffbenchError(f"{what}: Config must be frozen: @dataclass(frozen=True)")
     return cls

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import itertools
 import types
 from pathlib import Path
@@ -11,11 +12,13 @@ from typing import Any
 import pytest
 import torch
 
+import offbench
 from offbench.algorithm import Algorithm, Network, PolicyParts
 from offbench.algorithm.interface import Distribution
 from offbench.common.errors import OffbenchError
 from offbench.training import registry
-from offbench.training.registry import load_algorithm
+from offbench.training.registry import algorithm_names, load_algorithm
+from offbench.training.spec import Times
 from tests.cli.test_bad_input import refusal
 
 
@@ -23,6 +26,13 @@ def own(**parts: Any) -> type:
     """Return TD3+BC with mistakes of one's own: what `update` logs, what `policy` returns."""
     changed = {name: lambda self, *_, found=found: found(self) for name, found in parts.items()}
     return type("AWAC", (load_algorithm("td3_bc"),), changed)
+
+
+def with_setting(field: Any) -> type:
+    """Return TD3+BC with one more setting: its name, type and default."""
+    td3_bc = load_algorithm("td3_bc")
+    config = dataclasses.make_dataclass("Config", [field], bases=(td3_bc.Config,), frozen=True, kw_only=True)
+    return type("AWAC", (td3_bc,), {"Config": config})
 
 
 COUNT = itertools.count()
@@ -92,6 +102,14 @@ OWN: dict[str, tuple[type, str]] = {
         type("AWAC", (Algorithm,), {"Config": dataclasses.make_dataclass("Config", ["normalize"])}),
         "algorithm 'awac' (awac:AWAC): its Config lacks the setting batch_size",
     ),
+    "an option's name": (
+        with_setting(("steps", int, 3)),
+        "the setting steps has the name of an option of training; rename it",
+    ),
+    "no default": (
+        with_setting(("need", int)),
+        "the setting need needs a default",
+    ),
     "no parts": (own(policy=lambda self: self.actor.layers(0)), "AWAC.policy must return PolicyParts, not a list"),
 }
 
@@ -114,3 +132,12 @@ def test_two_algorithms_of_one_name_are_refused(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(registry, "_entry_points", lambda: {"bc": points})
     with pytest.raises(OffbenchError, match=r"two algorithms are named 'bc': offbench\.algos\.bc:BC and mine:BC"):
         load_algorithm("bc")
+
+
+def test_every_option_of_train_is_reserved() -> None:
+    """A setting of its name could not be given."""
+    options = set(inspect.signature(offbench.train).parameters) - {"settings"}
+    entry = {"name", "label", "datasets", *(field.name for field in dataclasses.fields(Times))}
+    assert options | entry | {"help"} <= registry.RESERVED_SETTINGS
+    for name in algorithm_names():
+        assert not registry.RESERVED_SETTINGS & {f.name for f in dataclasses.fields(load_algorithm(name).Config)}

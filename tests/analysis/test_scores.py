@@ -15,6 +15,7 @@ from scipy import stats
 
 import offbench
 from offbench.analysis.normalize import FORMATS, notes, render
+from offbench.analysis.results import read_results
 from offbench.cli.main import main
 from offbench.common.scores import interval, mean_std, normalize, run_return
 from offbench.envs.recipes import d4rl_reference
@@ -124,6 +125,17 @@ def test_runs_whose_scores_do_not_compare_are_refused(differ: dict[str, Any], ho
     write_run(2, [90.0], **({"env_spec": '{"id": "X-v0"}'} | differ))
     with pytest.raises(offbench.OffbenchError, match=f"seed-0 and .*seed-2 .*{how}"):
         offbench.normalize("runs")
+    other = Path("runs/x-v0").rename("runs/y-v0")
+    for path in other.rglob("config.json"):
+        path.write_text(path.read_text().replace("x-v0", "y-v0"))
+    write_run(0, [90.0])
+    assert len(read_results("runs", datasets=["x-*"]).entries) == 1  # the others are left out
+    assert len(offbench.inventory("runs", runs="runs")["runs"]) == 4
+
+
+def test_numpys_numbers_are_numbers() -> None:
+    for returns in (np.array([12135.0]), np.array([12135.0, 0.0])):
+        assert offbench.normalize(env="halfcheetah", returns=returns)[0]["d4rl_score"] == 100
 
 
 def test_returns_of_an_environment() -> None:

@@ -14,7 +14,8 @@ import offbench
 from offbench.agents.behaviour import behaviour
 from offbench.agents.ladder import find_ladder, read_ladder
 from offbench.benchmarks.datasets import check_recorded
-from offbench.benchmarks.grid import Source
+from offbench.benchmarks.grid import Grid, Source, load_grid
+from offbench.benchmarks.plan import prepare
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.data.card import card
@@ -135,3 +136,49 @@ def test_a_card_of_ones_own_looks_where_the_agent_was_trained(tiny: tuple[str, s
     main(shlex.split(hint)[1:])  # as it can be pasted
     with pytest.raises(OffbenchError, match="tiny-medium-replay-v0 is not recorded yet"):
         card(tiny[0], behaviour_dir=tiny[1])
+
+
+ENTRIES = 'seeds = 1\nsteps = 20\neval_every = 20\neval_episodes = 1\n[[algorithms]]\nname = "bc"\nhidden = [8]\n'
+
+
+def grid_of(dataset: str) -> Grid:
+    Path("mine.toml").write_text(f"datasets = [{dataset}]\n{ENTRIES}")
+    return load_grid("./mine.toml")
+
+
+@pytest.mark.parametrize(
+    ("dataset", "source"),
+    [
+        ('{id = "hopper-expert-v0", steps = 500}', ("hopper", "expert", 500)),
+        ('{id = "my-random-v0", env = "hopper", steps = 500}', ("hopper", "random", 500)),
+        ('{id = "my-30percent-v0", env = "hopper"}', ("hopper", "0.3", None)),
+        ('{id = "mine-v0", env = "hopper"}', ("hopper", "medium", None)),
+        ('{id = "mine-v0", env = "hopper", level = "0.3"}', ("hopper", "0.3", None)),
+        ('"hopper-medium-v2"', ("", "", None)),
+    ],
+)
+def test_a_table_may_leave_out_what_the_id_names(
+    dataset: str, source: tuple[str, str, int | None], home: Path
+) -> None:
+    (read,) = grid_of(dataset).datasets
+    assert (read.env, read.level, read.steps) == source
+
+
+@pytest.mark.parametrize(
+    ("dataset", "message"),
+    [
+        ('{id = "hopper-random-v0", level = "medium"}', "hopper-random-v0 is not at level medium"),
+        ('{id = "my-random-v0", env = "hopper", level = "0.3"}', "my-random-v0 is not at level 0.3"),
+        ('{id = "theirs-v2", steps = 500}', "theirs-v2 needs env"),
+        ('"hopper-mediun-v0"', "unknown level 'mediun'"),
+    ],
+)
+def test_an_id_that_contradicts_its_table_is_refused(dataset: str, message: str, home: Path) -> None:
+    with pytest.raises(OffbenchError, match=message):
+        grid_of(dataset)
+
+
+def test_a_recorded_blend_is_used_by_its_id(home: Path) -> None:
+    name = offbench.collect("inverted-pendulum", mix="random:0.5,expert:0.5", steps=200, workers=1)
+    assert grid_of(f'"{name}"').datasets == (Source(name),)
+    assert prepare("./mine.toml").missing() == []

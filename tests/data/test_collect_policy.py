@@ -7,7 +7,9 @@ import json
 import os
 import pickle
 import shutil
+import subprocess
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -221,3 +223,31 @@ def test_an_edit_of_a_policys_module_is_noticed(
         dataset = offbench.collect(tiny[0], policy=f"edited_policies:{name}", name="edited", **more)
         hashes.append(minari_store.read_metadata(dataset)["offbench"]["parts"][0]["policy_sha256"])
     assert hashes[0] != hashes[1]
+
+
+NOISY = """
+import numpy as np
+
+rng = np.random.default_rng(0)
+
+
+def act(o):
+    return [rng.uniform(-3, 3)]
+"""
+
+
+def test_a_function_that_draws_is_called_in_one_process(
+    home: Path, tiny: tuple[str, str], offbench_cli: Callable[..., subprocess.CompletedProcess[str]]
+) -> None:
+    """Copies of it in other processes would draw the same numbers; and whether it has changed, nobody can tell."""
+    (home / "noisy_policy.py").write_text(NOISY)
+    words = ("collect", tiny[0], "--behaviour-dir", tiny[1], "--policy", "noisy_policy:act", "--steps", "400")
+    for workers in ("1", "3"):
+        done = offbench_cli(*words, "--name", f"noisy{workers}", "--workers", workers)
+        assert done.returncode == 0, done.stderr
+    one, three = (offbench.load(f"tiny-noisy{workers}-v0") for workers in (1, 3))
+    assert one.content == three.content
+    assert len(np.unique(np.array(three.actions))) > 390
+    done = offbench_cli(*words, "--name", "noisy1")
+    assert done.returncode == 2
+    assert "whether noisy_policy:act still acts as it did then cannot be told; --overwrite" in done.stderr

@@ -266,6 +266,15 @@ def test_a_real_training(medium: str, home: Path) -> None:
     ]
     written = json.loads((folders[-1] / "similarity.json").read_text())
     assert found["by Q (%)"] == f"{written['q_similar']:.1f} ± ?"
+    assert "tolerances differ" not in (home / "out" / "tables" / "similarity.md").read_text()
+    similarity(folders[0], samples=256, tolerance=5.0)  # a mean of unequal tolerances says nothing
+    offbench.report(home / "runs", home / "out")
+    ((row),) = rows(home / "out" / "tables" / "similarity.csv")
+    assert row["bdb (beta=0.25)"] == "-"
+    assert row["td3_bc"] == f"{written['q_similar']:.1f} ± ?"
+    assert "tolerances differ" in (home / "out" / "tables" / "similarity.md").read_text()
+    details = [r for r in rows(home / "out" / "tables" / "similarity-details.csv") if "0.25" in r["method"]]
+    assert [r["seeds"] for r in details] == ["1", "1"]
 
 
 @pytest.mark.parametrize("seeds", [2, 6])

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -203,3 +204,14 @@ def test_an_ensemble_of_numbers_is_checked_for_nan(medium: str) -> None:
     stack = Stack(load_algorithm("bdb"), stack_specs, load_datasets(stack_specs), "cpu")
     stack.tensors = lambda: {"actor.scale": torch.tensor([[1.0, 2.0], [3.0, float("nan")]])}  # type: ignore[method-assign]
     assert stack.diverged() == {1: "actor.scale"}
+
+
+def test_numpys_numbers_are_numbers(medium: str) -> None:
+    beta: Any = np.linspace(0.25, 0.75, 2)
+    times: dict[str, Any] = {"steps": np.int64(20), "eval_every": np.int32(10), "eval_episodes": 1}
+    wide: dict[str, Any] = {"hidden": np.array([8, 8]), "batch_size": np.int64(4), "workers": 1}
+    folders = offbench.train("bdb", medium, beta=beta, seeds=np.arange(1), **times, **wide)
+    configs = [json.loads((folder / "config.json").read_text()) for folder in folders]
+    assert [config["settings"]["beta"] for config in configs] == [0.25, 0.75]
+    assert configs[0]["settings"]["hidden"] == [8, 8]
+    assert configs[0]["steps"] == 20
