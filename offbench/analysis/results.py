@@ -309,9 +309,7 @@ def entries_of(
                 raise unknown("dataset", pattern, ids)
         groups = {key: group for key, group in groups.items() if any(fnmatch(key[0], p) for p in datasets)}
         unevaluated = [run for run in unevaluated if any(fnmatch(run.config().dataset, p) for p in datasets)]
-    if compared:
-        _check_evaluated_alike(groups)
-    tasks = _tasks(groups)
+    tasks = _tasks(groups, compared)
     configs: dict[tuple[str, str], list[RunConfig]] = {}
     for (_, _, algorithm, variant), group in groups.items():
         configs.setdefault((algorithm, variant), []).extend(trained.config for trained in group)
@@ -325,35 +323,25 @@ def entries_of(
     return entries, unevaluated
 
 
-def _tasks(groups: Mapping[tuple[str, str, str, str], Sequence[EvaluatedRun]]) -> dict[tuple[str, str], Task]:
+def _tasks(
+    groups: Mapping[tuple[str, str, str, str], Sequence[EvaluatedRun]], compared: bool
+) -> dict[tuple[str, str], Task]:
     """Return the task of each (dataset, content), with a reference that all its runs have."""
-    runs = _by_data(groups)
+    runs: dict[tuple[str, str], list[EvaluatedRun]] = {}
+    for key, group in groups.items():
+        runs.setdefault(key[:2], []).extend(group)
     ids = [dataset for dataset, _ in runs]
     tasks = {}
     for (dataset, content), group in runs.items():
+        kinds = {(t.config.env_spec, *t.config.references.items()): t for t in group}
+        for one, other in itertools.combinations(kinds.values(), 2) if compared else ():
+            _check_evaluated_alike(one, other)
         references = [name for name in ("dataset", "d4rl") if all(t.config.references.get(name) for t in group)]
         tasks[dataset, content] = Task(dataset, content, references[0] if references else None, ids.count(dataset) > 1)
     return tasks
 
 
-def _by_data(
-    groups: Mapping[tuple[str, str, str, str], Sequence[EvaluatedRun]],
-) -> dict[tuple[str, str], list[EvaluatedRun]]:
-    """Return the runs of each (dataset, content)."""
-    runs: dict[tuple[str, str], list[EvaluatedRun]] = {}
-    for key, group in groups.items():
-        runs.setdefault(key[:2], []).extend(group)
-    return runs
-
-
-def _check_evaluated_alike(groups: Mapping[tuple[str, str, str, str], Sequence[EvaluatedRun]]) -> None:
-    for group in _by_data(groups).values():
-        kinds = {(t.config.env_spec, *t.config.references.items()): t for t in group}
-        for one, other in itertools.combinations(kinds.values(), 2):
-            _check_pair(one, other)
-
-
-def _check_pair(one: EvaluatedRun, other: EvaluatedRun) -> None:
+def _check_evaluated_alike(one: EvaluatedRun, other: EvaluatedRun) -> None:
     """Refuse two runs on the same data whose returns, or scores, do not compare."""
     a, b = one.config, other.config
     if a.env_spec and b.env_spec and not same_environment(a.env_spec, b.env_spec):
