@@ -10,13 +10,12 @@ import dataclasses
 import functools
 import math
 import re
+import sys
 import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
-
-import numpy as np
 
 from offbench.common.errors import DamagedError, OffbenchError, unknown
 from offbench.common.text import LARGEST_INTEGER, whole_number
@@ -188,7 +187,8 @@ def _convert(value: object, hint: Any, parse: bool) -> Any:
 def _convert_one(value: object, option: Any, parse: bool) -> Any:
     if option is Any:
         return value
-    if isinstance(value, np.generic):
+    numpy = sys.modules.get("numpy")  # --help does without it
+    if numpy is not None and isinstance(value, numpy.generic):
         value = value.item()
     if typing.get_origin(option) is tuple:
         items = typing.get_args(option)
