@@ -127,7 +127,7 @@ def test_ones_own_environment_runs_with_trust(own: Path, capsys: pytest.CaptureF
 
 
 def test_a_plan_runs_nothing_that_a_dataset_names(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    dataset = collect("inverted-pendulum", "random", steps=300, workers=1)
+    dataset = collect("inverted-pendulum", "random", steps=300, workers=1, dataset_id="own-v0")
     path = own / "minari" / dataset / "data" / "metadata.json"
     spec = json.dumps(POLE | {"id": "Foo-v0", "entry_point": "own:Own"})
     path.write_text(json.dumps(json.loads(path.read_text()) | {"env_spec": spec, "eval_env_spec": spec}))
