@@ -95,7 +95,7 @@ def save_replay(path: Path, episodes: Iterator[ReplayEpisode]) -> dict[str, int 
 def load_replay(
     path: Path, expected_sha256: str, observations: gym.spaces.Box, low: Array, high: Array
 ) -> Iterator[Episode]:
-    """Yield the recorded episodes, actions in the environment's bounds, observations in its precision.
+    """Yield the recorded episodes, in the environment's bounds and precision.
 
     Raises:
         OffbenchError: the file is missing, damaged, or not the one its ladder describes.
@@ -119,7 +119,7 @@ def load_replay(
         yield Episode(
             NO_SEED,
             arrays["observations"][row : row + length + 1].astype(observations.dtype),
-            actions.astype(np.float32),
+            actions.astype(low.dtype),
             arrays["rewards"][step : step + length].astype(np.float64),
             bool(terminated),
             not terminated,

@@ -24,7 +24,7 @@ from offbench.common.files import JsonObject, damage, open_regular
 from offbench.rollouts.policy import ACTIVATIONS, Layers, Policy
 
 LARGEST = 2**30  # bytes of a member, unpacked
-FLATTEN = "<class 'stable_baselines3.common.torch_layers.FlattenExtractor'>"  # of an MLP policy: changes no vector
+FLATTEN = "<class 'stable_baselines3.common.torch_layers.FlattenExtractor'>"  # leaves vectors as they are
 
 
 def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
@@ -44,11 +44,11 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
         raise OffbenchError(f"no file {path}") from None
     if settings.get("use_sde") is True:
         raise OffbenchError(f"{path} uses gSDE exploration, which offbench does not play")
-    kwargs = settings.get("policy_kwargs")
-    extractor = str(kwargs.get("features_extractor_class", "")) if isinstance(kwargs, dict) else ""
+    extractor = _policy_argument(settings, "features_extractor_class")
     if extractor not in ("", FLATTEN) or any("features_extractor." in name for name in tensors):
         raise OffbenchError(
-            f"{path} has a features extractor of its own; give --policy module:function, which acts as it"
+            f"{path} has a features extractor of its own, which offbench does not play; "
+            "give --policy module:function, a function that calls the agent"
         )
     kind, layers, algorithm, default = _layers(path, tensors)
     activation = _activation(path, settings, default)
@@ -149,10 +149,15 @@ def _bounds(settings: JsonObject, name: str, default: Array, actions: int) -> Ar
     return values if len(values) == actions else np.resize(default, actions)
 
 
+def _policy_argument(settings: JsonObject, name: str) -> str:
+    """Return SB3's text of one of policy_kwargs, "" if it is not given."""
+    arguments = settings.get("policy_kwargs")
+    return str(arguments.get(name, "")) if isinstance(arguments, dict) else ""
+
+
 def _activation(path: Path, settings: JsonObject, default: str) -> str:
     """Return the activation, parsed from SB3's text of policy_kwargs."""
-    kwargs = settings.get("policy_kwargs")
-    text = str(kwargs.get("activation_fn", "")) if isinstance(kwargs, dict) else ""
+    text = _policy_argument(settings, "activation_fn")
     name = re.sub(r"^<class '(?:\w+\.)*(\w+)'>$", r"\1", text).lower() or default
     if name not in ACTIVATIONS:
         raise OffbenchError(f"{path} has the activation {text:.60}; offbench plays {', '.join(ACTIVATIONS)}")

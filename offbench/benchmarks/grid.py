@@ -144,11 +144,13 @@ def _source(value: object, folder: Path, where: str) -> Source:
         env, level = _recipe_of(source.id)
         level = source.level or level
     if not env and source != Source(source.id):
-        raise OffbenchError(f"{where}: {source.id} needs env, the recipe to record it with")
+        raise OffbenchError(f"{where}: {source.id} needs env, the recipe that its level, steps and seed belong to")
     if level:
         name, _ = parse_level(level)
         if named and name != parse_level(named)[0]:
-            raise OffbenchError(f"{where}: {source.id} is not at level {level}; give it another id")
+            raise OffbenchError(
+                f"{where}: the id {source.id} names the level {named}, not {level}; give it another id"
+            )
     return dataclasses.replace(source, env=env, level=level)
 
 

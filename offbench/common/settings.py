@@ -138,6 +138,12 @@ def check(cls: type, name: str, value: object, where: str, *, parse: bool = True
     return value
 
 
+def without_numpy(value: object) -> Any:
+    """Return a NumPy number or array as Python's number or list, which JSON can hold; anything else as it is."""
+    numpy = sys.modules.get("numpy")  # not imported here, because --help does without it
+    return value.tolist() if numpy and isinstance(value, numpy.generic | numpy.ndarray) else value
+
+
 def short_repr(value: object) -> str:
     """Return the repr of a value, shortened for an error message."""
     try:
@@ -187,9 +193,7 @@ def _convert(value: object, hint: Any, parse: bool) -> Any:
 def _convert_one(value: object, option: Any, parse: bool) -> Any:
     if option is Any:
         return value
-    numpy = sys.modules.get("numpy")  # --help does without it
-    if numpy is not None and isinstance(value, numpy.generic):
-        value = value.item()
+    value = without_numpy(value)
     if typing.get_origin(option) is tuple:
         items = typing.get_args(option)
         parts = re.split("[,x]", value) if isinstance(value, str) and parse else value  # 64x64 as folders are named

@@ -7,10 +7,7 @@ import functools
 import itertools
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
-
-import numpy.typing as npt
 
 from offbench.agents.build_ladder import random_reference
 from offbench.agents.ladder import BEHAVIOUR, MEDIUM, MEDIUM_AT_MOST, MEDIUM_LIMITS, NEAR, Ladder, Rung, find_ladder
@@ -106,7 +103,7 @@ def collect(
     def prepare(ladder: Ladder | None) -> tuple[_Recording, list[Rung | None], list[int], JsonObject]:
         recording = _Recording(recipe, ladder, seed, workers, policy_source)
         sources = [recording.source(part, accept) for part in parts]
-        counts = _counts(recipe, ladder, parts, steps)
+        counts = recording.counts(parts, steps)
         return recording, sources, counts, _metadata(recording, dataset_id, mix or level, parts, sources, counts)
 
     ladder = find_ladder(recipe, Path(behaviour_dir), retrain)
@@ -115,8 +112,8 @@ def collect(
     if prepared and not overwrite and minari_store.exists(dataset_id) and _is_same(dataset_id, prepared[-1]):
         if prepared[0].calls_function:
             raise OffbenchError(
-                f"{dataset_id} is recorded already, and whether {policy} still acts as it did then cannot be told; "
-                "--overwrite records it again, --name records another dataset"
+                f"{dataset_id} is recorded already, but {policy} may act differently now (a function can read files); "
+                "record it again with --overwrite, or another dataset with --name"
             )
         minari_store.tidy(dataset_id)
         inform(f"{dataset_id} is recorded already, from the same policies and seed")
@@ -129,7 +126,7 @@ def collect(
         total = sum(counts)
         with Progress(total, f"recording {dataset_id}") as progress:
             streams = (recording.episodes(*item) for item in zip(parts, sources, counts, itertools.count()))
-            episodes = _counted(itertools.chain.from_iterable(streams), progress, recording.spaces[1].dtype)
+            episodes = _counted(itertools.chain.from_iterable(streams), progress)
             content = minari_writer.write(path, episodes, recording.spec, metadata, total, recording.spaces)
     if seed == 0 and steps is None and not retrain and (comparison := compare_with_card(recipe, name, content)):
         inform(comparison)
@@ -164,21 +161,6 @@ def _train(env: str, behaviour_dir: Path, workers: int) -> Ladder:
     recipe.env_spec()  # refuses a bad environment before the training is announced
     inform(f"{recipe.name} has no behaviour agent in {behaviour_dir} yet; training one first")
     return behaviour(env, behaviour_dir=behaviour_dir, workers=workers)
-
-
-def _counts(recipe: Recipe, ladder: Ladder | None, parts: tuple[Part, ...], steps: int | None) -> list[int]:
-    """Return the transitions of each part; medium-replay alone has all transitions of the training."""
-    available = ladder.info.medium_replay.transitions if ladder else None
-    total = steps if steps is not None else full_size(parts, recipe.dataset_steps, available)
-    counts = shares(parts, total)
-    if 0 in counts:
-        raise OffbenchError(f"{total} steps leave a part of the blend without a transition; use more --steps")
-    for part, count in zip(parts, counts, strict=True):
-        if part.source == "replay" and available is not None and count > available:
-            raise OffbenchError(
-                f"medium-replay of {recipe.name} has {available:,} transitions, not {count:,}; use fewer --steps"
-            )
-    return counts
 
 
 class _Recording:
@@ -218,6 +200,25 @@ class _Recording:
             return dict(self._ladder.info.references)
         with Rollouts(self.spec, self.workers) as rollouts:
             return {"random": random_reference(self.recipe, 0, rollouts)}
+
+    def full_size(self, parts: tuple[Part, ...]) -> int:
+        """Return the transitions of a dataset at its full size."""
+        replay_steps = self._ladder.info.medium_replay.transitions if self._ladder else None
+        return full_size(parts, self.recipe.dataset_steps, replay_steps)
+
+    def counts(self, parts: tuple[Part, ...], steps: int | None) -> list[int]:
+        """Return the transitions of each part; `steps` are those of all, None for the full size."""
+        total = self.full_size(parts) if steps is None else steps
+        counts = shares(parts, total)
+        if 0 in counts:
+            raise OffbenchError(f"{total} steps leave a part of the blend without a transition; use more --steps")
+        for part, count in zip(parts, counts, strict=True):
+            if part.source == "replay" and count > (available := self.ladder.info.medium_replay.transitions):
+                raise OffbenchError(
+                    f"medium-replay of {self.recipe.name} has {available:,} transitions, not {count:,}; "
+                    "use fewer --steps"
+                )
+        return counts
 
     def source(self, part: Part, accept: bool) -> Rung | None:
         """Return the rung a part is played by, or None for uniform actions and the replay.
@@ -274,9 +275,8 @@ class _Recording:
             expected = self.ladder.info.medium_replay.sha256
             yield from cut_at(load_replay(self.ladder.replay, expected, self.observation_space, *self.bounds), count)
             return
-        workers = 0 if self.calls_function else self.workers  # copies of a function would draw the same numbers
         with (
-            Rollouts(self.spec, workers) as rollouts,
+            Rollouts(self.spec, 0 if self.calls_function else self.workers) as rollouts,
             # the part is in the seed, so that both halves of medium-expert have their own episodes
             contextlib.closing(
                 rollouts.episodes(self.policy(rung), self.seed, (index,), transitions_needed=count)
@@ -333,10 +333,9 @@ def cut_at(episodes: Iterator[Episode], count: int) -> Iterator[Episode]:
             return
 
 
-def _counted(episodes: Iterator[Episode], progress: Progress, dtype: npt.DTypeLike) -> Iterator[Episode]:
-    """Yield the episodes, with actions of the action space's `dtype`, and count their steps."""
+def _counted(episodes: Iterator[Episode], progress: Progress) -> Iterator[Episode]:
     for episode in episodes:
-        yield replace(episode, actions=episode.actions.astype(dtype, copy=False))
+        yield episode
         progress.to(progress.done + len(episode))
 
 
@@ -351,8 +350,7 @@ def _metadata(
     """Return the dataset's metadata: Minari's fields, and offbench's own under one key."""
     recipe, references, made = recording.recipe, recording.references, versions()
     described = [recording.describe(*item) for item in zip(parts, sources, counts, strict=True)]
-    replay_steps = recording._ladder.info.medium_replay.transitions if recording._ladder else None
-    full, total = full_size(parts, recipe.dataset_steps, replay_steps), sum(counts)
+    full, total = recording.full_size(parts), sum(counts)
     short = f" A short recording: {total:,} of {full:,} transitions." if total < full else ""
     origin_texts = [recording.origin_text(part, rung) for part, rung in zip(parts, sources, strict=True)]
     if recording.own_policy:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import itertools
 from collections.abc import Sequence
 
 from offbench.analysis.methods import Method
@@ -20,7 +20,7 @@ def similarity_tables(results: Results) -> list[Table]:
     paper = {(r["env"], r["level"], r["method"]): r["similar_score_percent"] for r in published("similarity")}
     similar = {key: values for key, entry in results.entries.items() if (values := _similar(entry))}
     methods = [method for method in results.methods if any(key[1] == method for key in similar)]
-    tolerances = {(v.tolerance, v.action_tolerance) for values in similar.values() for v in values}
+    differ = len({value.tolerance for values in similar.values() for value in values}) > 1
     rows, details = [], []
     for task in results.tasks:
         env, level = task.env_and_level
@@ -30,19 +30,10 @@ def similarity_tables(results: Results) -> list[Table]:
                 cells.append(EMPTY)
                 continue
             number = paper.get((env, level, _similar_name(method)))
-            below = [f"paper {number}"] if number else []
-            alike: dict[tuple[float, float], list[Similarity]] = {}
-            for value in similar[task, method]:
-                alike.setdefault((value.tolerance, value.action_tolerance), []).append(value)
-            if len(tolerances) > 1:
-                below.append(f"tolerance {' and '.join(f'{q:g}' for q, _ in sorted(alike))}")
-            for values in alike.values():
-                by_q, by_action = (
-                    mean_std([getattr(v, key) for v in values]) for key in ("q_similar", "action_similar")
-                )
-                details.append([*row_name(results, task), *_similar_row(method, values, by_q, by_action, number)])
-            mean = Cell(plus_minus(by_q), by_q[0]) if len(alike) == 1 else Cell("-")
-            cells.append(dataclasses.replace(mean, below=", ".join(below)))
+            values = similar[task, method]
+            cells.append(_similar_cell(values, number, differ))
+            for group in _by_tolerances(values):
+                details.append([*row_name(results, task), *_similar_row(method, group, number)])
         if any(cell is not EMPTY for cell in cells):
             rows.append([*row_name(results, task), *cells])
     if not rows:
@@ -54,9 +45,9 @@ def similarity_tables(results: Results) -> list[Table]:
         "formula; this reading of its Table 2 is ours."
         + (" “paper”: its printed number, on D4RL's v0 datasets." if has_paper_numbers else "")
     ]
-    if len(tolerances) > 1:
+    if differ:
         notes.append(
-            "The runs' tolerances differ. Scores of different tolerances do not compare, and are not averaged."
+            "The tolerances differ between runs. Scores with different tolerances are neither comparable nor averaged."
         )
     header = ["level", "environment", *[method.label for method in methods]]
     columns = ["level", "environment", "method", "by Q (%)", "by action (%)", "paper (%)", "seeds", "step", "samples"]
@@ -85,15 +76,34 @@ def _similar_name(method: Method) -> str:
     return "bdb beta=0.00 (td3_bc)" if method.published in ("td3_bc", "bdb beta=0.00") else method.published
 
 
+def _by_tolerances(values: Sequence[Similarity]) -> list[list[Similarity]]:
+    """Return the runs' similar scores in groups of the same tolerances."""
+
+    def tolerances(value: Similarity) -> tuple[float, float]:
+        return value.tolerance, value.action_tolerance
+
+    return [list(group) for _, group in itertools.groupby(sorted(values, key=tolerances), tolerances)]
+
+
+def _similar_cell(values: Sequence[Similarity], number: str | None, differ: bool) -> Cell:
+    """Return the mean by Q, "-" if the runs' tolerances differ; `differ`: whether any in the table do."""
+    tolerances = sorted({value.tolerance for value in values})
+    below = [f"paper {number}"] if number else []
+    if differ:
+        below.append(f"tolerance {' and '.join(f'{t:g}' for t in tolerances)}")
+    if len(tolerances) > 1:
+        return Cell("-", below=", ".join(below))
+    by_q = mean_std([value.q_similar for value in values])
+    return Cell(plus_minus(by_q), by_q[0], ", ".join(below))
+
+
 def _similar_row(
     method: Method,
     values: Sequence[Similarity],
-    by_q: tuple[float, float | None],
-    by_action: tuple[float, float | None],
     number: str | None,
 ) -> list[Cell]:
+    by_q, by_action = (mean_std([getattr(v, key) for v in values]) for key in ("q_similar", "action_similar"))
     steps, samples = (sorted({getattr(v, key) for v in values}) for key in ("step", "samples"))
-    tolerances = sorted({f"Q {v.tolerance:g}, action {v.action_tolerance:g}" for v in values})
     numbers = [Cell(", ".join(f"{n:,}" for n in ns), ns[0]) for ns in (steps, samples)]
     return [
         Cell(method.label),
@@ -102,5 +112,5 @@ def _similar_row(
         Cell(number, float(number)) if number else EMPTY,
         Cell(str(len(values)), len(values)),
         *numbers,
-        Cell("; ".join(tolerances)),
+        Cell(f"Q {values[0].tolerance:g}, action {values[0].action_tolerance:g}"),
     ]

@@ -17,13 +17,12 @@ import numpy.typing as npt
 from offbench.common.arrays import Array
 from offbench.common.errors import SHOW_TRACEBACK, OffbenchError
 
-FUNCTION_PREFIX = b"offbench-function "  # never begins a policy file: only this process names functions to workers
 TOLERANCE = 1e-5  # beyond the bounds, of float32 actions
 
 
 @dataclass(frozen=True)
 class FunctionPolicy:
-    """Acts by calling a function once per observation.
+    """Acts by calling a function once per observation, in this process: its copies would draw the same numbers.
 
     Attributes:
         name: `module:function`, importable from the current folder.
@@ -61,11 +60,6 @@ class FunctionPolicy:
             actions.append(np.clip(action, self.low, self.high))
         return np.array(actions, np.float32).reshape(len(observations), len(self.low))
 
-    def to_bytes(self) -> bytes:
-        """Return the bytes from which a worker process makes this policy."""
-        bounds = np.stack([self.low, self.high]).astype(np.float32).tobytes()
-        return FUNCTION_PREFIX + self.name.encode() + b"\0" + bounds
-
     def source(self) -> bytes:
         """Return the source of the module, and of the one that defines the function if it is another, for its hash."""
         paths = [getattr(sys.modules.get(self.name.partition(":")[0]), "__file__", None)]
@@ -92,10 +86,3 @@ def function_policy(name: str, low: Array, high: Array) -> FunctionPolicy:
     if not callable(function):
         raise OffbenchError(f"the module {module} has no function {attribute!r}")
     return FunctionPolicy(name, low, high, function)
-
-
-def from_worker_bytes(data: bytes) -> FunctionPolicy:
-    """Make the policy that `to_bytes` wrote, in a worker process."""
-    name, bounds = data.removeprefix(FUNCTION_PREFIX).split(b"\0", 1)
-    low, high = np.frombuffer(bounds, np.float32).reshape(2, -1)
-    return function_policy(name.decode(), low, high)

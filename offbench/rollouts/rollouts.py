@@ -31,7 +31,7 @@ from offbench.common.processes import closing, start_errors, start_worker, unint
 from offbench.common.scores import interval
 from offbench.common.seeds import Purpose
 from offbench.envs.environments import LONGEST_EPISODE, Env, make_env, reason, time_limit
-from offbench.rollouts.function_policy import FUNCTION_PREFIX, FunctionPolicy, from_worker_bytes
+from offbench.rollouts.function_policy import FunctionPolicy
 from offbench.rollouts.policy import Policy, from_bytes
 
 T = TypeVar("T")
@@ -77,13 +77,13 @@ class Task:
 
     Attributes:
         spec: EnvSpec JSON.
-        policy: the bytes of a policy file, or of a FunctionPolicy.
+        policy: the bytes of a policy file, or a function, which no worker process is given.
         seed, stream: with an episode's index, the seed of the episode.
         indices: of the episodes.
     """
 
     spec: str
-    policy: bytes
+    policy: bytes | FunctionPolicy
     seed: int
     stream: tuple[int, ...]
     indices: tuple[int, ...]
@@ -135,9 +135,10 @@ class _RunningEpisode:
 
     def step(self, action: Array) -> Episode | None:
         """Take one step; return the whole episode if it was the last one."""
-        self.actions.append(action.astype(self.env.action_space.dtype))
-        observation, reward, terminated, truncated = step(self.env, self.actions[-1].copy())  # it may change it
+        action = action.astype(self.env.action_space.dtype)
+        observation, reward, terminated, truncated = step(self.env, action.copy())  # it may change its copy
         self.observations.append(observation)
+        self.actions.append(action)
         self.rewards.append(reward)
         if not (terminated or truncated):
             if len(self.rewards) > self.limit:
@@ -235,7 +236,7 @@ def play_stats(task: Task) -> list[EpisodeStats]:
 
 
 def _play(task: Task, keep: Callable[[Episode], T]) -> list[T]:
-    policy = _policy(task.policy)
+    policy = task.policy if isinstance(task.policy, FunctionPolicy) else _policy(task.policy)
     noisy = policy.needs_noise(task.deterministic)
     envs = cached_envs(task.spec, min(PARALLEL_EPISODES, len(task.indices)))
     waiting = iter(range(len(task.indices)))
@@ -262,8 +263,8 @@ def _play(task: Task, keep: Callable[[Episode], T]) -> list[T]:
 
 
 @functools.lru_cache(maxsize=4)
-def _policy(data: bytes) -> Policy | FunctionPolicy:
-    return from_worker_bytes(data) if data.startswith(FUNCTION_PREFIX) else from_bytes(data)
+def _policy(data: bytes) -> Policy:
+    return from_bytes(data)
 
 
 @functools.lru_cache(maxsize=4)
@@ -285,7 +286,7 @@ def cached_envs(spec: str, count: int) -> list[Env]:
 class Rollouts:
     """Plays episodes of one environment, in this process (workers = 0) or in a pool of worker processes.
 
-    Use as a context manager. Results do not depend on `workers`.
+    Use as a context manager. Results do not depend on `workers`. A FunctionPolicy needs workers = 0.
     """
 
     def __init__(self, spec: str, workers: int = 0) -> None:
@@ -330,7 +331,8 @@ class Rollouts:
             transitions_needed: the number of transitions that the caller needs: near it, tasks become small, and no
                 episode starts that is unlikely to be needed.
         """
-        data, ahead = policy.to_bytes(), 1 if not self._pool else 2 * self.workers + 1
+        ahead = 1 if not self._pool else 2 * self.workers + 1
+        data = policy if isinstance(policy, FunctionPolicy) else policy.to_bytes()
         pending: collections.deque[Future[list[Episode]]] = collections.deque()
         begun = done = steps = 0
         try:
@@ -354,7 +356,7 @@ class Rollouts:
                 future.cancel()
 
     def start_evaluation(
-        self, policy: Policy | FunctionPolicy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
+        self, policy: Policy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
     ) -> list[Future[list[EpisodeStats]]]:
         """Start `count` evaluation episodes; `gathered` waits for their returns and lengths, in order."""
         data, parts = policy.to_bytes(), max(1, min(self.workers, count // 2))  # a task per worker, if they suffice

@@ -182,7 +182,10 @@ def by_common_step(specs: Sequence[RunSpec]) -> list[list[RunSpec]]:
 
 
 def _check_environment(spec: RunSpec, data: Transitions) -> None:
-    """Refuse a run that was evaluated in another environment so far, or in none; contact margins make others."""
+    """Refuse a run that was evaluated in another environment so far, or in none.
+
+    Other contact margins make another environment.
+    """
     before = spec.run.config().env_spec
     if not same_environment(before, data.env_spec):
         raise OffbenchError(

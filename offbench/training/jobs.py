@@ -10,7 +10,7 @@ import collections
 import contextlib
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
@@ -133,14 +133,17 @@ def _train_here(job: Job, index: int, progress: JobProgress) -> list[str]:
         return []
     try:
         return train_job(job, lambda step, note: progress.report(index, step, note))
-    except OffbenchError as error:
-        if len(progress.jobs) == 1:
-            raise
-        return [str(error)]
     except Exception as error:
         if len(progress.jobs) == 1:
             raise
-        return [f"{job.title}: {describe_failure(error, progress.print_trace)}"]
+        return [_problem(job, error, progress.print_trace)]
+
+
+def _problem(job: Job, error: Exception, write_traceback: Callable[[str], object]) -> str:
+    """Return the line for the failure of one of several jobs."""
+    return (
+        str(error) if isinstance(error, OffbenchError) else f"{job.title}: {describe_failure(error, write_traceback)}"
+    )
 
 
 class _Pool(contextlib.AbstractContextManager["_Pool"]):
@@ -212,8 +215,6 @@ def _worker(job: Job, sender: Connection, parent: int) -> None:
     traces: list[str] = []
     try:
         lines = train_job(job, lambda step, note: sender.send((step, note, None)))
-    except OffbenchError as error:
-        lines = [str(error)]
     except Exception as error:
-        lines = [f"{job.title}: {describe_failure(error, traces.append)}"]
+        lines = [_problem(job, error, traces.append)]
     sender.send((None, "".join(traces), lines))

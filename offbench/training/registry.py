@@ -33,7 +33,7 @@ OWN_VARIABLE = "OFFBENCH_OWN_ALGORITHMS"  # {name: "module:class"} as JSON, for 
 _own: dict[str, type[Algorithm]] = {}  # this process's own algorithms
 
 
-# options of `train`, its Python function and the entries of a grid, which settings must not be named as
+# names of the arguments of `train` and of the keys of a grid's entry, which no setting may have
 RESERVED_SETTINGS = {
     *("algorithm", "command", "dataset", "datasets", "device", "download", "env", "eval_episodes", "eval_every"),
     *("fresh", "help", "label", "name", "precision", "runs", "seeds", "stack", "steps", "tensorboard", "wandb"),

@@ -174,7 +174,7 @@ def _tokens(source: str) -> Iterator[str]:
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node, clean=False):
             docstrings.add((node.body[0].lineno, node.body[0].col_offset))
-    lines = source.splitlines(keepends=True)
+    lines = io.StringIO(source).readlines()
     opened: list[tuple[int, int]] = []  # where the f-strings around a token begin
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         kind = tokenize.tok_name[token.type]

@@ -15,11 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeGuard
 from urllib.parse import quote
 
-import numpy as np
-
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import JsonObject, sha256
-from offbench.common.settings import check, fields, setting
+from offbench.common.settings import check, fields, setting, without_numpy
 from offbench.training.loggers import NO_DESTINATIONS, Destinations
 from offbench.training.registry import load_algorithm, register
 from offbench.training.run import Run
@@ -191,7 +189,7 @@ def configurations(
     for name, value in settings.items():
         if name not in valid:
             raise unknown(f"setting of {algorithm}", name, valid)
-        value = value.tolist() if isinstance(value, np.ndarray) else value
+        value = without_numpy(value)
         values = list(value) if _is_varied(value, valid[name].default) else [value]
         if not values:
             raise OffbenchError(f"{algorithm}: {name} is an empty list")

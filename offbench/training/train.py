@@ -10,13 +10,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from offbench.algorithm.interface import Algorithm
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import check_seed
-from offbench.common.settings import build
+from offbench.common.settings import build, without_numpy
 from offbench.data import transitions
 from offbench.envs.recipes import load_recipe
 from offbench.training.devices import Machine, pick_machine
@@ -82,7 +80,7 @@ def train(
     Raises:
         OffbenchError: anything that the user can fix, in one line.
     """
-    times = Times(_seed_list(seeds), *map(_python_number, (steps, eval_every, eval_episodes)))
+    times = Times(_seed_list(seeds), *map(without_numpy, (steps, eval_every, eval_episodes)))
     names = [dataset] if isinstance(dataset, str) else list(dict.fromkeys(dataset))
     env_spec = load_recipe(env).env_spec() if env is not None else None
     variants = specs_of(algorithm, settings, names, times, Path(runs), precision, env_spec)
@@ -188,11 +186,6 @@ def _try_update(spec: RunSpec, datasets: Datasets) -> None:
 
 def _seed_list(seeds: int | Sequence[int]) -> tuple[int, ...]:
     return tuple(map(check_seed, seeds if isinstance(seeds, Iterable) else [seeds]))
-
-
-def _python_number(value: int) -> int:
-    """Return a NumPy number as Python's, which config.json can hold; anything else as it is."""
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def _check_times(times: Times) -> None:

@@ -167,8 +167,11 @@ def test_a_table_may_leave_out_what_the_id_names(
 @pytest.mark.parametrize(
     ("dataset", "message"),
     [
-        ('{id = "hopper-random-v0", level = "medium"}', "hopper-random-v0 is not at level medium"),
-        ('{id = "my-random-v0", env = "hopper", level = "0.3"}', "my-random-v0 is not at level 0.3"),
+        ('{id = "hopper-random-v0", level = "medium"}', "the id hopper-random-v0 names the level random, not medium"),
+        (
+            '{id = "my-random-v0", env = "hopper", level = "0.3"}',
+            "the id my-random-v0 names the level random, not 0.3",
+        ),
         ('{id = "theirs-v2", steps = 500}', "theirs-v2 needs env"),
         ('"hopper-mediun-v0"', "unknown level 'mediun'"),
     ],
