@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from offbench.common.files import write_json
-from offbench.training.run import Run, RunConfig
+from offbench.training.run import Run
+from offbench.training.run_config import RunConfig
 from offbench.training.spec import run_folder
 
 COMMAND = "offbench train {algorithm} --dataset {dataset} --seeds 0:{seeds} --steps {steps}"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from offbench.common.errors import OffbenchError, nearest, unknown
 from offbench.training.registry import FORMER_SETTINGS, algorithm_names
-from offbench.training.run import RunConfig
+from offbench.training.run_config import RunConfig
 from offbench.training.spec import folder_name
 
 METHOD_ORDER = ("td3_bc", "cql", "bdb")  # of the BDB paper's Table 1

@@ -27,7 +27,8 @@ from offbench.common.terminal import warn
 from offbench.common.text import from_to, plural
 from offbench.data.levels import LEVELS, env_and_level
 from offbench.envs.environments import same_environment
-from offbench.training.run import DIGITS, Run, RunConfig, find_runs
+from offbench.training.run import DIGITS, Run, find_runs
+from offbench.training.run_config import RunConfig
 
 # the order of the BDB paper's Table 1; levels are in its order already
 ENV_ORDER = ("hopper", "walker2d", "halfcheetah")

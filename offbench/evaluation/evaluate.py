@@ -22,7 +22,8 @@ from offbench.envs.trust import REMEDY, is_trusting
 from offbench.evaluation.policies import load_policy
 from offbench.rollouts.policy import Policy
 from offbench.rollouts.rollouts import Rollouts, gathered
-from offbench.training.run import Run, RunConfig
+from offbench.training.run import Run
+from offbench.training.run_config import RunConfig
 
 
 @dataclass(frozen=True)

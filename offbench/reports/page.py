@@ -14,7 +14,8 @@ from offbench.common.tables import Cell, Table
 from offbench.reports.figures import Figure, LineStyle
 from offbench.reports.markup import Markup, breakable, join, prose, tag
 from offbench.reports.tables import cell_id
-from offbench.training.run import Run, Session
+from offbench.training.run import Run
+from offbench.training.run_config import Session
 
 
 @dataclass(frozen=True)

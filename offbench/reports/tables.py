@@ -15,7 +15,8 @@ from offbench.analysis.statistics import Estimate, Scores, improvement, iqm, pai
 from offbench.common.scores import SCORED_EVALUATIONS, mean_std, plus_minus
 from offbench.common.tables import Cell, Table
 from offbench.common.text import counted, from_to
-from offbench.training.run import DIGITS, RunConfig
+from offbench.training.run import DIGITS
+from offbench.training.run_config import RunConfig
 
 PAPER = "BDB paper, Table 1"
 PAPER_METHODS = {"td3_bc", "cql", *(f"bdb beta={beta}" for beta in ("0.25", "0.50", "0.75", "adaptive"))}

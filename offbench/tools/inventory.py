@@ -17,7 +17,8 @@ from offbench.training.registry import algorithm_names
 
 if TYPE_CHECKING:
     from offbench.analysis.results import EvaluatedRun
-    from offbench.training.run import Run, RunConfig
+    from offbench.training.run import Run
+    from offbench.training.run_config import RunConfig
 
 
 def inventory(what: str | None = None, *, runs: str | Path = "runs") -> JsonObject:

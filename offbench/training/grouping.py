@@ -30,7 +30,8 @@ from offbench.envs.version_warning import warn_other_physics
 from offbench.training.captured_update import WARM_UP
 from offbench.training.devices import Machine
 from offbench.training.registry import load_algorithm
-from offbench.training.run import TRAIN_ANEW, RunConfig
+from offbench.training.run import TRAIN_ANEW
+from offbench.training.run_config import RunConfig
 from offbench.training.source_code import code_of
 from offbench.training.spec import Job, RunSpec, settings_json
 from offbench.training.stack import Stack

@@ -15,15 +15,13 @@ import contextlib
 import csv
 import dataclasses
 import itertools
-import json
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import (
-    JsonObject,
     csv_bytes,
     damage,
     delete,
@@ -34,98 +32,18 @@ from offbench.common.files import (
     write_bytes,
     write_json,
 )
-from offbench.common.provenance import Hardware, TrainingPlatform
-from offbench.common.scores import LARGEST_VALUE, Evaluations, are_references, check_steps
+from offbench.common.provenance import TrainingPlatform
+from offbench.common.scores import LARGEST_VALUE, Evaluations, check_steps
 from offbench.common.settings import read_back
 from offbench.training.registry import current_settings
+from offbench.training.run_config import FORMAT, RunConfig, Session
 from offbench.training.source_code import changes
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
-FORMAT = "offbench-run-1"
 DELETE_TO_REPEAT = "delete the run to repeat it"
 TRAIN_ANEW = "delete that run (`train` does with --fresh) or give another --runs"
 DIGITS = 8  # of a content hash, where a table must tell two contents of one dataset id apart
 MUST_MATCH = ("algorithm", "settings", "dataset", "dataset_sha256", "seed", "eval_every", "eval_episodes")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Session:
-    """The platform that trained a run from `step` on, on which its results depend besides settings and seed.
-
-    Attributes:
-        device, precision, versions, hardware: as in offbench.common.provenance.training_platform.
-    """
-
-    step: int = 0
-    device: str = ""
-    precision: str = ""
-    versions: dict[str, str] = field(default_factory=dict)
-    hardware: Hardware = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunConfig:
-    """A run's config.json: all that is needed to repeat the run, and to score it without its dataset.
-
-    Attributes:
-        dataset_sha256: the content hash of the dataset.
-        references: (random, expert) returns by name: `dataset`, its own, and `d4rl`, D4RL's constants.
-        env_spec: the environment it is evaluated in, as EnvSpec JSON; None if the dataset names none.
-        device, precision, versions, hardware: of the first session.
-        code: hashes of the algorithm's files (offbench.training.source_code); empty in runs of earlier versions.
-        sessions: the later sessions that were trained with something else.
-        label: the method's name in tables, if a grid gives one.
-    """
-
-    format: str = FORMAT
-    algorithm: str
-    variant: str
-    settings: JsonObject
-    dataset: str
-    dataset_sha256: str
-    seed: int
-    steps: int
-    eval_every: int = 0
-    eval_episodes: int = 0
-    references: dict[str, tuple[float, float] | None]
-    env_id: str = ""
-    env_spec: str | None = None
-    command: str = ""
-    device: str = ""
-    precision: str = ""
-    versions: dict[str, str] = field(default_factory=dict)
-    hardware: Hardware = field(default_factory=dict)
-    code: dict[str, str] = field(default_factory=dict)
-    sessions: tuple[Session, ...] = ()
-    label: str = ""
-
-    def __post_init__(self) -> None:
-        """Raise OffbenchError for values that no run has."""
-        if self.format != FORMAT:
-            raise OffbenchError(f"format is {self.format[:40]!r}, not {FORMAT}: another version of offbench wrote it")
-        for name in ("algorithm", "variant", "dataset", "label"):
-            if len(getattr(self, name).splitlines()) > 1:
-                raise OffbenchError(f"{name} has several lines, which would be rows of their own in tables")
-        if self.seed < 0 or not 0 <= self.steps < LARGEST_VALUE:
-            raise OffbenchError(f"seed {self.seed} or steps {self.steps} is out of range")
-        if self.env_spec is not None:
-            try:
-                is_spec = isinstance(json.loads(self.env_spec), dict)
-            except (ValueError, RecursionError):
-                is_spec = False
-            if not is_spec:
-                raise OffbenchError(f"env_spec is not an EnvSpec but {self.env_spec:.60}")
-        for name, pair in self.references.items():
-            if name not in ("dataset", "d4rl"):
-                raise OffbenchError(f"unknown references {name!r}")
-            if pair and not are_references(*pair):
-                raise OffbenchError(f"the references ({name}) are {pair[0]} and {pair[1]}")
-
-    @property
-    def history(self) -> list[Session]:
-        """All sessions, the first one included."""
-        first = Session(device=self.device, precision=self.precision, versions=self.versions, hardware=self.hardware)
-        return [first, *self.sessions]
 
 
 @dataclass(frozen=True)
@@ -191,7 +109,7 @@ class Run:
             raise OffbenchError(f"{reason}; run the command again")
 
     def claim(self, config: RunConfig) -> None:
-        """Write config.json, unless the folder holds this run already.
+        """Write config.json; only a new label, if the folder holds this run already.
 
         A run that stopped before its first checkpoint starts over.
 
@@ -202,6 +120,7 @@ class Run:
         if self.config_path.exists() and self._mismatch(config):
             self.clear()
         if self.config_path.exists():
+            self._relabel(config.label)
             return
         with self.locked():
             if not self.config_path.exists():
@@ -209,6 +128,12 @@ class Run:
                 write_json(self.config_path, {k: v for k, v in values.items() if k != "sessions" or v})
                 return
         self.claim(config)  # another process was faster
+
+    def _relabel(self, label: str) -> None:
+        """Record another label; an empty one changes nothing."""
+        if label not in ("", self.config().label):
+            with self.locked():
+                write_json(self.config_path, dict(read_json(self.config_path, DELETE_TO_REPEAT), label=label))
 
     @property
     def has_checkpoint(self) -> bool:

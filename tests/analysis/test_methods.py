@@ -8,7 +8,7 @@ import pytest
 
 from offbench.analysis.methods import Method, find_method, name_methods, unnamed_settings
 from offbench.common.errors import OffbenchError
-from offbench.training.run import RunConfig
+from offbench.training.run_config import RunConfig
 
 
 def named(*methods: tuple[str, str, object], labels: tuple[str, ...] = ()) -> list[Method]:

@@ -20,7 +20,8 @@ from offbench.cli.main import main
 from offbench.common.scores import interval, mean_std, normalize, run_return
 from offbench.envs.recipes import d4rl_reference
 from offbench.reports.figures import plot_curves
-from offbench.training.run import Run, RunConfig, find_runs
+from offbench.training.run import Run, find_runs
+from offbench.training.run_config import RunConfig
 
 
 def test_normalize_by_hand() -> None:

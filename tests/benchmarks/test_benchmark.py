@@ -145,6 +145,11 @@ def test_settings_of_each_dataset_are_one_column(home: Path) -> None:
     results = read_results("runs")
     assert score_table(results).header == ["level", "environment", "tuned"]
     assert list(results.scores(find_method(results.methods, "tuned"))) == ids
+    (home / "grid.toml").write_text(text.replace("tuned", "tuned again"))
+    trained = [run.policy_path.stat().st_mtime_ns for run in find_runs(home / "runs")]
+    assert benchmark(prepare("./grid.toml", workers=1), say=silent)
+    assert [row["method"] for row in offbench.normalize()] == ["tuned again", "tuned again"]
+    assert [run.policy_path.stat().st_mtime_ns for run in find_runs(home / "runs")] == trained
 
 
 def test_a_finished_grid_is_left_alone_and_its_table_is_of_its_runs(

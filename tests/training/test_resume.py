@@ -19,7 +19,8 @@ from offbench.cli.main import main
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
 from offbench.training.registry import algorithm_names
-from offbench.training.run import Run, Session, find_runs
+from offbench.training.run import Run, find_runs
+from offbench.training.run_config import Session
 
 SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 100, "eval_episodes": 2, "workers": 1}
 HALF: dict[str, Any] = {"precision": "bfloat16", "hidden": (64, 64)}  # a CPU multiplies narrower layers in float32
