@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from offbench.analysis.methods import find_method
+from offbench.analysis.methods import find_method, unnamed_settings
 from offbench.analysis.results import (
     REFERENCES,
     Entry,
@@ -51,6 +51,7 @@ class Comparison:
         comparable: whether both runs of each pair are scored over evaluations at the same steps.
         unfinished: how many of the paired runs have not reached their last step, or have diverged.
         changed: the algorithms whose paired runs were trained by different code.
+        settings: for each group whose name leaves out settings that differ from the defaults, these.
     """
 
     a: str
@@ -64,6 +65,7 @@ class Comparison:
     comparable: bool
     unfinished: int
     changed: tuple[str, ...]
+    settings: tuple[str, ...]
 
     def __repr__(self) -> str:
         """Return the verdict."""
@@ -115,6 +117,8 @@ class Comparison:
             )
         if self.unfinished:
             lines.append(f"note: {self.unfinished} of the paired runs did not reach their last step")
+        if self.settings:
+            lines.append(f"note: settings that differ from the defaults: {'; '.join(self.settings)}")
         for algorithm in self.changed:
             lines.append(f"note: the runs of {algorithm} were trained by different code")
         if self.unpaired:
@@ -145,6 +149,7 @@ class Comparison:
             "unfinished": self.unfinished,
             "comparable": self.comparable,
             "changed": list(self.changed),
+            "settings": list(self.settings),
             "verdict": self.verdict,
         }
 
@@ -187,6 +192,7 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
         comparable(both),
         sum(t.state != "finished" for side in trained for t in side),
         tuple(keys_with_mixed_code((t.config.algorithm, t) for side in trained for t in side)),
+        tuple(unnamed_settings(group[0].method for group in groups)),
     )
 
 

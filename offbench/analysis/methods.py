@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from offbench.common.errors import OffbenchError, nearest, unknown
+from offbench.common.text import without_steps
 from offbench.training.registry import FORMER_SETTINGS, algorithm_names
 from offbench.training.run_config import RunConfig
 from offbench.training.spec import folder_name
@@ -126,7 +127,7 @@ def find_method(methods: Sequence[Method], name: str) -> Method:
     Raises:
         OffbenchError: no such method here, or the algorithm has several variants.
     """
-    name = re.sub(r" \([\d,]+( of [\d,]+)? steps\)$", "", " ".join(name.split()))  # as in a column's heading
+    name = without_steps(name)
     for matches in ([m for m in methods if m.label == name], [m for m in methods if name in m.spellings]):
         if len(matches) == 1:
             return matches[0]

@@ -103,7 +103,7 @@ def score_returns(env: str, returns: Sequence[float]) -> list[Row]:
         raise OffbenchError(f"returns must be finite numbers below {scores.LARGEST_VALUE:g}, not {list(returns)}")
     ladder = shipped_ladder(recipe) or read_ladder(folder_of(recipe, 0, BEHAVIOUR) / "ladder")
     ours = (ladder.random_return, ladder.expert_return) if ladder and ladder.check(recipe) else None
-    d4rl = (recipe.d4rl_min, recipe.d4rl_max) if recipe.d4rl_min is not None else None
+    d4rl = recipe.d4rl_reference()
     if not ours and not d4rl:
         raise OffbenchError(
             f"{env} has no reference scores yet; measure them with `offbench behaviour {shlex.quote(env)}`"
@@ -113,7 +113,7 @@ def score_returns(env: str, returns: Sequence[float]) -> list[Row]:
             "environment": recipe.env_id,
             "return": value,
             "score": scores.normalize(value, *ours) if ours else None,
-            "d4rl_score": scores.normalize(value, *d4rl) if d4rl else None,  # type: ignore[arg-type]
+            "d4rl_score": scores.normalize(value, *d4rl) if d4rl else None,
         }
         for value in returns
     ]

@@ -11,14 +11,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-import numpy as np
-
 from offbench.benchmarks.datasets import record_source
 from offbench.benchmarks.grid import Source
-from offbench.benchmarks.plan import Benchmark, Plan, prepare
+from offbench.benchmarks.plan import Benchmark, Plan, is_longer, prepare, shard_of
 from offbench.common.errors import OffbenchError
 from offbench.training.jobs import raise_first, run_jobs
-from offbench.training.spec import Job, RunSpec
+from offbench.training.spec import Job
 from offbench.training.train import Training
 
 UNITS = {"s": 1, "m": 60, "h": 3600}
@@ -82,13 +80,14 @@ def benchmark(
     deadline = time.time() + _seconds(budget) if budget else None
     executor = executor or LocalExecutor(deadline)
     bench = prepare(grid) if isinstance(grid, str) else grid
-    plan = Plan(bench)
+    plan = Plan(bench, shard)
     for line in plan:
         say(line)
     executor.record(bench.missing(), bench.machine.workers)
     if bench.missing():
         return False  # out of time
-    training = Training(shard_of(bench, shard), bench.machine, command=command)
+    specs = [spec for share in shard_of(bench, shard) for spec in share if not is_longer(spec)]
+    training = Training(specs, bench.machine, command=command)
     for line in training.diverged:  # in an earlier call, which raised for it
         say(line)
     raise_first(training.run(executor.train, deadline=deadline, cost=plan.update_seconds))
@@ -104,21 +103,3 @@ def _seconds(text: str) -> float:
     if not 0 < value < float("inf"):
         raise OffbenchError(f"a budget must be positive, not {text!r}")
     return value
-
-
-def shard_of(bench: Benchmark, shard: tuple[int, int]) -> list[RunSpec]:
-    """Return a shard's runs: a share of each variant. It depends only on the grid, because the machines may differ.
-
-    Raises:
-        OffbenchError: there is no such shard.
-    """
-    index, count = shard
-    if not 0 <= index < count:
-        raise OffbenchError(f"a shard is i/n with i from 0 to n - 1, not {index}/{count}")
-    specs: list[RunSpec] = []
-    offset = 0
-    for variant in bench.variants:
-        share = np.array_split(np.arange(len(variant)), count)[(index - offset) % count]
-        specs += [variant[i] for i in share]
-        offset += len(variant)  # the first shares may have one run more; the next variant starts after them
-    return specs

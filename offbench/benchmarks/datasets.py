@@ -21,16 +21,7 @@ WAIT = 5.0  # seconds between two checks of a dataset that another process recor
 
 
 def record_source(source: Source, workers: int) -> None:
-    """Record a grid's dataset, or wait for the process that records it.
-
-    Raises:
-        OffbenchError: its id names no level of an environment that has a recipe, or it cannot be recorded.
-    """
-    if not source.env:
-        raise OffbenchError(
-            f"{source.id} is neither a local dataset nor a level of an environment with a recipe; record or download "
-            "it, or give its env and level in the grid"
-        )
+    """Record a grid's dataset, or wait for the process that records it. Raises OffbenchError if it cannot be."""
     while source.id not in minari_store.local_ids():
         try:
             collect(
@@ -44,12 +35,19 @@ def record_source(source: Source, workers: int) -> None:
 
 
 def check_recorded(source: Source) -> None:
-    """Check that a grid's dataset, if it exists already, is the one that the grid would record.
+    """Check that a grid's dataset can be recorded or, if it exists already, is the one that the grid would record.
 
     Raises:
-        OffbenchError: it has another environment, level, seed or size.
+        OffbenchError: its id names no level of an environment that has a recipe, or it has another environment,
+            level, seed or size.
     """
-    if not source.env or not minari_store.exists(source.id):
+    exists = minari_store.exists(source.id)
+    if not exists and not source.env:
+        raise OffbenchError(
+            f"{source.id} is neither a local dataset nor a level of an environment with a recipe; record or download "
+            "it, or give its env and level in the grid"
+        )
+    if not exists or not source.env:
         return
     recipe = load_recipe(source.env)
     if differences := list(_differences(minari_store.read_metadata(source.id), source, recipe)):

@@ -101,27 +101,58 @@ def prepare(
     return Benchmark(read, tuple(variants), pick_machine(device, workers, stack, precision), precision)
 
 
+def shard_of(bench: Benchmark, shard: tuple[int, int]) -> list[list[RunSpec]]:
+    """Return a shard's runs: a share of each variant. It depends only on the grid, because the machines may differ.
+
+    Raises:
+        OffbenchError: there is no such shard.
+    """
+    index, count = shard
+    if not 0 <= index < count:
+        raise OffbenchError(f"a shard is i/n with i from 0 to n - 1, not {index}/{count}")
+    shares = []
+    offset = 0
+    for variant in bench.variants:
+        share = np.array_split(np.arange(len(variant)), count)[(index - offset) % count]
+        shares.append([variant[i] for i in share])
+        offset += len(variant)  # the first shares may have one run more; the next variant starts after them
+    return shares
+
+
+def is_longer(spec: RunSpec) -> bool:
+    """Return whether a run has more updates already than its grid asks for."""
+    return spec.run.newest_checkpoint() > spec.steps
+
+
 class Plan:
     """The lines of a plan: a grid's size, and the cost of its unfinished runs here. A finished grid is not measured.
 
     Attributes:
         update_seconds: seconds per update of one run, evaluations included, of each algorithm in the lines so far.
+
+    Args:
+        shard: (i, n): of the i-th of n shares of the runs only.
     """
 
-    def __init__(self, bench: Benchmark) -> None:
-        self.bench = bench
+    def __init__(self, bench: Benchmark, shard: tuple[int, int] = (0, 1)) -> None:
+        self.bench, self.shard = bench, shard
         self.update_seconds: dict[str, float] = {}
 
     def __iter__(self) -> Iterator[str]:
-        bench = self.bench
-        left = [[spec for spec in variant if not spec.run.finished(spec.steps)] for variant in bench.variants]
+        bench, (index, count) = self.bench, self.shard
+        shares = shard_of(bench, self.shard)
+        longer = sum(is_longer(spec) for share in shares for spec in share)
+        left = [[spec for spec in share if not _is_done(spec)] for share in shares]
         sizes = {
             "dataset": len(bench.grid.datasets),
             "variant": len(bench.variants),
             "run": sum(map(len, bench.variants)),
         }
         text = ", ".join(counted(size, noun) for noun, size in sizes.items())
-        yield f"{bench.grid.name}: {text}, {sum(map(len, left))} to train"
+        share = f" by shard {index}/{count}" if count > 1 else ""
+        yield f"{bench.grid.name}: {text}, {sum(map(len, left))} to train{share}"
+        if longer:
+            yield f"  left as they are: {counted(longer, 'run')} with more updates than the grid's steps"
         if not any(left):
             return
         env_specs = {source.env: load_recipe(source.env).env_spec() for source in bench.grid.datasets if source.env}
@@ -170,6 +201,10 @@ class Plan:
                 f"  on a GPU: not measured here; {self._products:.2g} operations in matrix products, which take "
                 f"{duration(self._products / GPU_SPEED)} if it does {GPU_SPEED / 1e12:.0f} Tflop/s of them"
             )
+
+
+def _is_done(spec: RunSpec) -> bool:
+    return spec.run.finished(spec.steps) or spec.run.diverged or is_longer(spec)
 
 
 def _cost(spec: RunSpec, rate: Rate, step_time: float, env_spec: str) -> float:

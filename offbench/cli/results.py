@@ -18,10 +18,13 @@ from offbench.cli.arguments import (
     positive_int,
     recipes,
 )
+from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
 from offbench.common.terminal import is_terminal, note, print_line, print_lines, print_table
 from offbench.common.text import counted
 
+OF_EPISODES = {"env", "episodes", "stochastic", "workers"}  # options of `evaluate` without --similarity
+OF_SIMILARITY = {"algorithm", "tolerance", "action_tolerance"}  # and with it
 RUNS_HELP = "folder of the runs (default: runs)"
 
 
@@ -118,8 +121,13 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `evaluate`."""
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_POLICY", help="run directories or policy files")
     complete_with(parser.add_argument("--env", help="environment to use instead of the policy's own"), recipes)
-    parser.add_argument("--episodes", type=positive_int, default=10, help="number of episodes (default: 10)")
-    parser.add_argument("--seed", type=non_negative_int, default=0, help="seed of the episodes (default: 0)")
+    parser.add_argument("--episodes", type=positive_int, help="number of episodes (default: 10)")
+    parser.add_argument(
+        "--seed",
+        type=non_negative_int,
+        default=0,
+        help="seed of the episodes, or of the similar score's sample (default: 0)",
+    )
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the mode")
     parser.add_argument(
         "--similarity", action="store_true", help="compute the similar score of runs on their datasets instead"
@@ -130,42 +138,47 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument(
         "--tolerance",
         type=number,
-        default=0.05,
         help="similar score: largest difference of Q, as a share of |Q1(s, a)| (default: 0.05)",
     )
     parser.add_argument(
         "--action-tolerance",
         type=number,
-        default=0.1,
         help="similar score by action: largest root mean square distance (default: 0.1)",
     )
     parser.add_argument("--workers", type=positive_int, help="processes (default: one per core)")
     add_trust_flag(parser)
 
-    def run(
-        paths: list[str],
-        similarity: bool,
-        algorithm: str | None,
-        tolerance: float,
-        action_tolerance: float,
-        **arguments: Any,
-    ) -> None:
+    def run(paths: list[str], similarity: bool, **arguments: Any) -> None:
+        given = {name: value for name, value in arguments.items() if value is not None and value is not False}
+        for name in given.keys() & (OF_EPISODES if similarity else OF_SIMILARITY):
+            which = "with" if similarity else "without"
+            raise OffbenchError(f"--{name.replace('_', '-')} has no effect {which} --similarity; leave it out")
+        if similarity:
+            _print_similarity(paths, **given)
+            return
         for path in paths:
-            if similarity:
-                _similar(path, arguments["seed"], algorithm, tolerance, action_tolerance)
-            else:
-                print_lines(offbench.evaluate(path, **arguments).lines())
+            print_lines(offbench.evaluate(path, **given).lines())
 
     parser.set_defaults(run=run)
 
 
-def _similar(path: str, seed: int, algorithm: str | None, tolerance: float, action_tolerance: float) -> None:
-    from offbench.evaluation.similarity import similarity
+def _print_similarity(paths: list[str], **options: Any) -> None:
+    """Print the similar score of each run; of several, those of algorithms without a critic are left out."""
+    from offbench.evaluation.similarity import NoCriticError, similarity
 
-    result = similarity(path, seed=seed, algorithm=algorithm, tolerance=tolerance, action_tolerance=action_tolerance)
-    print(f"{path}: similar score at step {result.step:,} over {result.samples:,} transitions")
-    print(f"by Q       {result.q_similar:.2f}%  (within {100 * tolerance:g}% of |Q1(s, a)|)")
-    print(f"by action  {result.action_similar:.2f}%  (root mean square distance at most {action_tolerance:g})")
+    for path in paths:
+        try:
+            result = similarity(path, **options)
+        except NoCriticError as error:
+            if len(paths) == 1:
+                raise
+            note(f"left out: {error}")
+            continue
+        print(f"{path}: similar score at step {result.step:,} over {result.samples:,} transitions")
+        print(f"by Q       {result.q_similar:.2f}%  (within {100 * result.tolerance:g}% of |Q1(s, a)|)")
+        print(
+            f"by action  {result.action_similar:.2f}%  (root mean square distance at most {result.action_tolerance:g})"
+        )
 
 
 def video_arguments(parser: Parser, _: list[str]) -> None:

@@ -19,7 +19,9 @@ from offbench.cli.arguments import (
     shard,
 )
 from offbench.cli.results import print_scores
+from offbench.common.errors import OffbenchError
 from offbench.common.terminal import hint, note, print_lines
+from offbench.common.text import without_steps
 
 SWITCHES = ("--tensorboard", "--trust", "--fresh", "--download")  # flags of `train` that take no value
 
@@ -66,11 +68,16 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     config = add_settings(parser, algorithm)
 
     def run(**arguments: Any) -> None:
+        from offbench.training.registry import RESERVED_SETTINGS
         from offbench.training.run import Run
 
         settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
         rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
         rest["algorithm"], settings = algorithm, named | settings
+        for key in RESERVED_SETTINGS & named.keys():
+            if key != "precision":
+                raise OffbenchError(f"no setting of {algorithm} is called {key}: give --{key}, not {words[0]!r}")
+            (rest[key],) = settings.pop(key)
         if moved:
             note(f"{moved} is an option of bdb_plus, no longer of bdb: training bdb_plus")
         kept = [word for word in words if word != "--fresh"]  # whoever repeats the command resumes
@@ -96,7 +103,7 @@ def _algorithm(words: list[str]) -> tuple[str | None, dict[str, Any]]:
     for before, word in zip(["", *words], words, strict=False):
         taken = before.startswith("--") and "=" not in before and not any(s.startswith(before) for s in SWITCHES)
         if not taken and not word.startswith("-"):
-            name, bracket, rest = word.partition(" (")
+            name, bracket, rest = without_steps(word).partition(" (")
             parts = [part.strip() for part in rest.removesuffix(")").split(",")] if bracket else []
             pairs = [part.partition("=") if "=" in part else ("beta", "=", part) for part in parts]
             return name, {key: [value] for key, _, value in pairs}
@@ -167,8 +174,10 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
         from offbench.analysis import normalize
         from offbench.benchmarks.plan import Plan, prepare
 
+        if address and executor != "ray":
+            raise OffbenchError("--address is of a Ray cluster: give --executor ray, too, or leave it out")
         if plan:
-            print_lines(Plan(prepare(**arguments)))
+            print_lines(Plan(prepare(**arguments), shard))
             return
         command = shlex.join(["offbench", "benchmark", *words])
         where = None

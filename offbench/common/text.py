@@ -60,6 +60,11 @@ def compact(number: int) -> str:
     return f"{number:,}"
 
 
+def without_steps(heading: str) -> str:
+    """Return a method's name from a column's heading: `td3_bc` from `td3_bc (300,000 steps)`."""
+    return re.sub(r" \([\d,]+( of [\d,]+)? steps\)$", "", " ".join(heading.split()))
+
+
 # control characters except tab and line feed; characters that reverse text, break lines or are invisible
 _CONTROLS = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u2069\ufeff\U000e0000-\U000e007f]"

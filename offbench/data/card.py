@@ -133,9 +133,7 @@ def _recorded(recipe: Recipe, ladder: Ladder, level: str, collect: str) -> Summa
 def _facts(recipe: Recipe, summary: Summary) -> JsonObject:
     meta, returns = summary.metadata, np.asarray(summary.returns)
     mean = float(returns.mean())
-    d4rl = None
-    if recipe.d4rl_min is not None and recipe.d4rl_max is not None:
-        d4rl = round(normalize(mean, recipe.d4rl_min, recipe.d4rl_max), 2)
+    d4rl = recipe.d4rl_reference()
     return {
         "transitions": int(summary.lengths.sum()),
         "episodes": len(returns),
@@ -144,7 +142,7 @@ def _facts(recipe: Recipe, summary: Summary) -> JsonObject:
         "min": round(float(returns.min()), 2),
         "max": round(float(returns.max()), 2),
         "score": round(normalize(mean, float(meta["ref_min_score"]), float(meta["ref_max_score"])), 2) + 0.0,  # no -0
-        "d4rl_score": d4rl,
+        "d4rl_score": round(normalize(mean, *d4rl), 2) if d4rl else None,
         "terminated": round(summary.terminated, 4),
         "content_sha256": minari_store.provenance(meta).content_sha256,
     }

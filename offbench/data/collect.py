@@ -379,7 +379,7 @@ def _metadata(
             "parts": described,
             "full_size": full,
             "references": references,
-            "d4rl": None if recipe.d4rl_min is None else [recipe.d4rl_min, recipe.d4rl_max],
+            "d4rl": recipe.d4rl_reference(),
             MARGIN: recipe.contact_margin if recording.mujoco else None,
             "versions": made,
         },

@@ -13,7 +13,7 @@ import contextlib
 import importlib.util
 import json
 import multiprocessing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeAlias
 
 import gymnasium as gym
@@ -29,7 +29,8 @@ from offbench.envs.trust import check_code
 
 Env: TypeAlias = gym.Env[Array, Array]
 Space: TypeAlias = gym.Space[Any]
-IDENTITY = ("id", "kwargs", "max_episode_steps")  # specs that agree in these and in the contact margins are the same
+PASSIVE_WRAPPERS = {"OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics"}  # wrappers that change nothing
+RENDERING_ARGUMENTS = {"render_mode", "width", "height", "camera_id", "camera_name", "default_camera_config"}
 LARGEST_BOUND = 1e6  # largest action bound; larger ones, such as float32's maximum, count as unbounded
 LONGEST_EPISODE = 20_000  # steps that an episode may take in an environment without a time limit
 LARGEST_LIMIT = 1_000_000  # a larger time limit counts as none
@@ -242,12 +243,24 @@ def _cache_health(env: Env) -> None:
 
 
 def same_environment(a: str | None, b: str | None) -> bool:
-    """Return whether two EnvSpecs (JSON) are the same environment; versions of wrappers do not count."""
+    """Return whether two EnvSpecs (JSON) are the same environment.
+
+    Rendering, wrappers that change nothing, and where the code of environment and wrappers is do not count.
+    """
     if a is None or b is None:
         return a is b
-    first, second = json.loads(a), json.loads(b)
-    same = all(first.get(key) == second.get(key) for key in IDENTITY)
-    return same and first.get(MARGIN, EARLIER) == second.get(MARGIN, EARLIER)
+    return _identity(json.loads(a)) == _identity(json.loads(b))
+
+
+def _identity(spec: Mapping[str, Any]) -> tuple[object, ...]:
+    """Return what an EnvSpec shares with those of the same environment."""
+    kwargs, wrappers = spec.get("kwargs") or {}, spec.get("additional_wrappers") or []
+    if isinstance(kwargs, dict):
+        kwargs = {key: value for key, value in kwargs.items() if key not in RENDERING_ARGUMENTS}
+    if isinstance(wrappers, list):
+        named = [(w.get("name"), w.get("kwargs") or {}) if isinstance(w, dict) else (w, {}) for w in wrappers]
+        wrappers = [wrapper for wrapper in named if str(wrapper[0]) not in PASSIVE_WRAPPERS]
+    return spec.get("id"), kwargs, spec.get("max_episode_steps"), wrappers, spec.get(MARGIN, EARLIER)
 
 
 def reason(error: BaseException) -> str:

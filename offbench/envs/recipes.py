@@ -21,7 +21,7 @@ from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import damage, read_text
 from offbench.common.scores import are_references
 from offbench.common.settings import build, setting, short_repr
-from offbench.envs.environments import env_spec
+from offbench.envs.environments import PASSIVE_WRAPPERS, RENDERING_ARGUMENTS, env_spec
 from offbench.envs.margin_rule import ADDED, EARLIER, with_margin
 
 T = TypeVar("T")
@@ -83,6 +83,17 @@ class Recipe:
     def env_spec(self) -> str:
         """Return the environment as Gymnasium's EnvSpec JSON. Raises OffbenchError if it cannot be made."""
         return with_margin(env_spec(self.env_id, **dict(self.env_kwargs)), self.contact_margin)
+
+    def d4rl_reference(self) -> tuple[float, float] | None:
+        """Return D4RL's reference returns (random, expert).
+
+        None if the recipe has none, or changes the task that shipped ones belong to.
+        """
+        if self.d4rl_min is None or self.d4rl_max is None:
+            return None
+        if self.folder is None and _shipped_recipe(self.env_id):
+            return d4rl_reference(self.env_spec())
+        return self.d4rl_min, self.d4rl_max
 
     def sha256(self) -> str:
         """Return the SHA-256 of the recipe's values, which its layout and comments do not affect."""
@@ -183,8 +194,12 @@ def _check(recipe: Recipe, where: str) -> None:
 D4RL_TASK = re.compile(r"(\w+)-v[2-5]", re.ASCII)
 D4RL_CODE = ("gymnasium.envs.mujoco", "gym.envs.mujoco")
 D4RL_LIMIT = 1000  # steps of an episode of D4RL's MuJoCo tasks
-PASSIVE_WRAPPERS = {"OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics"}  # wrappers that change nothing
-RENDERING_ARGUMENTS = {"render_mode", "width", "height", "camera_id", "camera_name", "default_camera_config"}
+
+
+def _shipped_recipe(env_id: str) -> Recipe | None:
+    """Return the shipped recipe of an environment's task, of any of D4RL's and Gymnasium's versions v2 to v5."""
+    task = D4RL_TASK.fullmatch(env_id)
+    return next((r for r in map(load_recipe, names()) if task and r.env_id.startswith(f"{task[1]}-v")), None)
 
 
 def d4rl_reference(spec: str | None) -> tuple[float, float] | None:
@@ -194,9 +209,8 @@ def d4rl_reference(spec: str | None) -> tuple[float, float] | None:
     time limit or wrappers are not the standard ones.
     """
     fields = json.loads(spec or "{}")
-    task = D4RL_TASK.fullmatch(str(fields.get("id")))
-    recipe = next((r for r in map(load_recipe, names()) if task and r.env_id.startswith(f"{task[1]}-v")), None)
-    if task is None or recipe is None or recipe.d4rl_min is None or recipe.d4rl_max is None:
+    recipe = _shipped_recipe(str(fields.get("id")))
+    if recipe is None or recipe.d4rl_min is None or recipe.d4rl_max is None:
         return None
     wrappers = {str(wrapper.get("name")) for wrapper in fields.get("additional_wrappers") or ()}
     standard = (

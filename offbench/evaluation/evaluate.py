@@ -12,7 +12,7 @@ import numpy as np
 from offbench.agents.ladder import shipped_references
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import default_workers
-from offbench.common.scores import interval, normalize
+from offbench.common.scores import interval, mean_std, normalize
 from offbench.common.seeds import Purpose, check_seed
 from offbench.common.text import counted
 from offbench.envs.environments import checked_spec, env_spec, same_environment
@@ -47,10 +47,11 @@ class Evaluation:
     def lines(self) -> list[str]:
         """Return the evaluation as text."""
         mean, low, high = interval(self.returns)
+        _, std = mean_std(self.returns)
+        spread = "" if std is None else f" (95% interval {low:.1f} to {high:.1f}), std {std:.1f}"
         lines = [
             f"{self.policy} in {self.env_id}{self.physics}: {counted(len(self.returns), 'episode')}",
-            f"return {mean:.1f} (95% interval {low:.1f} to {high:.1f}), std {np.std(self.returns):.1f}, "
-            f"length {np.mean(self.lengths):.0f}",
+            f"return {mean:.1f}{spread}, length {np.mean(self.lengths):.0f}",
         ]
         names = {"dataset": "own reference: random and expert of this environment", "d4rl": "D4RL's constants"}
         return lines + [f"normalized score {score:.1f} ({names[key]})" for key, score in self.scores.items()]

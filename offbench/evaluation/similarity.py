@@ -24,6 +24,10 @@ from offbench.common.settings import read_back
 from offbench.training.run import Run
 
 
+class NoCriticError(OffbenchError):
+    """A run's algorithm has no critic, so it has no similar score."""
+
+
 @dataclass(frozen=True)
 class Similarity:
     """A run's similarity.json.
@@ -67,7 +71,8 @@ def similarity(
         algorithm: the run's algorithm, if no installed package has it: `./my_algo.py:ReBRAC`, or the class.
 
     Raises:
-        OffbenchError: no run or checkpoint there, the algorithm has no critic, or its code has changed.
+        NoCriticError: the algorithm has no critic.
+        OffbenchError: no run or checkpoint there, or the algorithm's code has changed.
     """
     import torch  # slow to import; reports only read similarity.json
 
@@ -90,7 +95,7 @@ def similarity(
     pi = torch.from_numpy(policy.act(batch.observations[0].numpy(), noise)).unsqueeze(0)
     q_pi, q_data = (stack.algorithm.q_values(batch.observations, a) for a in (pi, batch.actions))
     if q_pi is None or q_data is None:
-        raise OffbenchError(f"{path}: {run.config().algorithm} has no critic to compare by")
+        raise NoCriticError(f"{path}: {run.config().algorithm} has no critic to compare by")
     distance = (pi - batch.actions).square().mean(-1).sqrt().flatten()
     score = Similarity(
         stack.step,

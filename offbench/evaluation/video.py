@@ -99,6 +99,8 @@ def _policy_of(path: str, env: str | None) -> tuple[Policy, str, bool]:
     if not colon or Path(path).exists():
         policy, _, spec = open_policy(Path(path), env)
         return policy, spec, policy.kind == "uniform"
+    if env is not None:
+        raise OffbenchError(f"{path} names its environment already; leave out --env, or give a policy file")
     recipe = load_recipe(name)
     source, *more = (part.source for part in parse_level(level)[1])
     spec = recipe.env_spec()

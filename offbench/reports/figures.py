@@ -84,10 +84,18 @@ def curve_figure(entries: Sequence[Entry], styles: Mapping[Method, LineStyle], n
     ends = [f"{label} {values.mean(0)[-1]:.1f}" for label, (steps, values) in curves.items() if steps]
     alt = f"Learning curves on {task.name}. At the last common evaluation: {', '.join(ends)}."
     caption = "Mean over seeds, 95% bootstrap interval shaded."
-    if any(entry.smoothed for entry in entries):
-        caption += f" Each point is the mean of the last {SCORED_EVALUATIONS} evaluations up to it."
+    caption += _smoothing(entries)
     shown = [styles[entry.method] for entry in entries]
     return _draw(name, caption, alt, lambda axes: _paint_curves(axes, entries, styles), shown)
+
+
+def _smoothing(entries: Sequence[Entry]) -> str:
+    """Return the sentence of a caption that names the curves whose points are means, "" if there are none."""
+    smoothed = list(dict.fromkeys(entry.method.label for entry in entries if entry.smoothed))
+    if not smoothed:
+        return ""
+    which = "Each point" if all(entry.smoothed for entry in entries) else f"Each point of {', '.join(smoothed)}"
+    return f" {which} is the mean of the last {SCORED_EVALUATIONS} evaluations up to it."
 
 
 def _paint_curves(axes: Axes, entries: Sequence[Entry], styles: Mapping[Method, LineStyle]) -> None:
@@ -182,7 +190,7 @@ def iqm_curve_figure(results: Results, styles: Mapping[Method, LineStyle]) -> Fi
         curves = {e.task.name: e.drawn_curve() for e in results.of(method) if e.task.reference}
         steps = sorted(set.intersection(*(set(curve[0]) for curve in curves.values()))) if curves else []
         if steps and curves.keys() == tasks:
-            whole[method] = steps[:: max(1, len(steps) // 40)], curves
+            whole[method] = steps[:: -max(1, len(steps) // 40)][::-1], curves  # the last one is kept
     if not whole:
         return None
 
@@ -193,6 +201,7 @@ def iqm_curve_figure(results: Results, styles: Mapping[Method, LineStyle]) -> Fi
         axes.set(xlabel="updates", ylabel="IQM of normalized scores", title="all tasks")
 
     caption = "Interquartile mean over all tasks, 95% interval shaded; methods that have all tasks."
+    caption += _smoothing([entry for method in whole for entry in results.of(method)])
     alt = f"Learning curves of the interquartile mean over all tasks: {', '.join(m.label for m in whole)}."
     return _draw("curves-iqm", caption, alt, paint, [styles[method] for method in whole])
 

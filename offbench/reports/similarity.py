@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 
@@ -11,6 +12,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.scores import mean_std, plus_minus
 from offbench.common.tables import Cell, Table
 from offbench.common.terminal import warn
+from offbench.common.text import counted, plural
 from offbench.evaluation.similarity import Similarity, read_similarity
 from offbench.reports.tables import EMPTY, is_papers_grid, published, row_name
 
@@ -31,7 +33,7 @@ def similarity_tables(results: Results) -> list[Table]:
                 continue
             number = paper.get((env, level, _similar_name(method)))
             values = similar[task, method]
-            cells.append(_similar_cell(values, number, differ))
+            cells.append(_similar_cell(results.entries[task, method], values, number, differ))
             for group in _by_tolerances(values):
                 details.append([*row_name(results, task), *_similar_row(method, group, number)])
         if any(cell is not EMPTY for cell in cells):
@@ -48,6 +50,11 @@ def similarity_tables(results: Results) -> list[Table]:
     if differ:
         notes.append(
             "The tolerances differ between runs. Scores with different tolerances are neither comparable nor averaged."
+        )
+    if any(" step" in cell.more for row in rows for cell in row[2:]):
+        notes.append(
+            "A cell that names a step is of an earlier checkpoint than its runs' newest; `offbench evaluate RUN "
+            "--similarity` computes it again."
         )
     header = ["level", "environment", *[method.label for method in methods]]
     columns = ["level", "environment", "method", "by Q (%)", "by action (%)", "paper (%)", "seeds", "step", "samples"]
@@ -85,16 +92,24 @@ def _by_tolerances(values: Sequence[Similarity]) -> list[list[Similarity]]:
     return [list(group) for _, group in itertools.groupby(sorted(values, key=tolerances), tolerances)]
 
 
-def _similar_cell(values: Sequence[Similarity], number: str | None, differ: bool) -> Cell:
-    """Return the mean by Q, "-" if the runs' tolerances differ; `differ`: whether any in the table do."""
-    tolerances = sorted({value.tolerance for value in values})
-    below = [f"paper {number}"] if number else []
-    if differ:
-        below.append(f"tolerance {' and '.join(f'{t:g}' for t in tolerances)}")
-    if len(tolerances) > 1:
-        return Cell("-", below=", ".join(below))
+def _similar_cell(entry: Entry, values: Sequence[Similarity], number: str | None, differ: bool) -> Cell:
+    """Return the mean by Q, or that there is none because the runs' tolerances or steps differ.
+
+    Args:
+        values: of the runs of `entry` that have one.
+        differ: whether tolerances differ within the table.
+    """
+    tolerances, steps = (sorted({getattr(value, key) for value in values}) for key in ("tolerance", "step"))
+    more = [f"tolerance {' and '.join(f'{t:g}' for t in tolerances)}"] if differ else []
+    if steps != sorted({trained.reached for trained in entry.runs}):
+        more.append(f"at {plural(len(steps), 'step')} {' and '.join(f'{step:,}' for step in steps)}")
+    if len(values) < len(entry.runs):
+        more.append(f"{len(values)} of {counted(len(entry.runs), 'run')}")
+    cell = Cell("not averaged", below=f"paper {number}" if number else "", more=", ".join(more))
+    if len(tolerances) > 1 or len(steps) > 1:
+        return cell
     by_q = mean_std([value.q_similar for value in values])
-    return Cell(plus_minus(by_q), by_q[0], ", ".join(below))
+    return dataclasses.replace(cell, text=plus_minus(by_q), value=by_q[0])
 
 
 def _similar_row(

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 
 from offbench.analysis.results import Results
-from offbench.common.scores import mean_std, plus_minus
-from offbench.common.tables import Cell, Table
-from offbench.reports.tables import EMPTY, row_name
+from offbench.common.scores import mean_std
+from offbench.common.tables import Table
+from offbench.reports.tables import EMPTY, mark_notes, row_name, score_cell
 
 
 def best_table(results: Results) -> Table | None:
@@ -17,7 +17,7 @@ def best_table(results: Results) -> Table | None:
     """
     variants = Counter(method.algorithm for method in results.methods)
     algorithms = [name for name, count in variants.items() if count > 1]
-    rows = []
+    rows, shown = [], []
     for task in results.tasks:
         cells = []
         for algorithm in algorithms:
@@ -26,14 +26,15 @@ def best_table(results: Results) -> Table | None:
                 cells.append(EMPTY)
                 continue
             best = max(entries, key=lambda entry: mean_std(entry.scores)[0])
-            score = mean_std(best.scores)
-            cells.append(Cell(plus_minus(score), score[0], more=f"{best.method.label}, best of {len(entries)}"))
+            cells.append(score_cell(best, f"{best.method.label}, best of {len(entries)}"))
+            shown.append(best)
         if any(cell is not EMPTY for cell in cells):
-            rows.append([*row_name(results, task), *cells])
+            rows.append([*row_name(results, task, scored=True), *cells])
     if not rows:
         return None
     notes = [
         "The variant with the highest mean score. It was selected by the score shown, so this number is "
-        "optimistic, and more so with more variants. To report it, train the selected variant with new seeds."
+        "optimistic, and more so with more variants. To report it, train the selected variant with new seeds.",
+        *mark_notes(shown),
     ]
     return Table("best", "Best variant of each algorithm", ["level", "environment", *algorithms], rows, notes, heads=2)

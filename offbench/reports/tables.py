@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import importlib.resources
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TypeAlias
 
 from offbench.analysis.compare import comparable, differences, favored, pair_runs
@@ -21,6 +21,11 @@ from offbench.training.run_config import RunConfig
 PAPER = "BDB paper, Table 1"
 PAPER_METHODS = {"td3_bc", "cql", *(f"bdb beta={beta}" for beta in ("0.25", "0.50", "0.75", "adaptive"))}
 EMPTY = Cell("-")
+MARKS = {"unfinished": " †", "diverged": " ‡"}
+MARK_NOTES = {
+    "unfinished": "† training is not finished: the number is of the steps done so far and may still change.",
+    "diverged": "‡ a run became NaN or infinite and stopped: the number is of its evaluations before that.",
+}
 Aggregates: TypeAlias = Mapping[Method, tuple[Estimate, Scores]]  # a method's IQM, and the scores behind it
 FEW_SEEDS = "A task with a single seed has no interval; with few seeds it covers less than 95% (docs/statistics.md)."
 DIFFERENT_DATA = (
@@ -68,9 +73,10 @@ def score_table(results: Results) -> Table:
             number = paper.get((env, level, method.published))
             below = "" if number is None else f"paper {number:g}"
             code = " §" if (task, method.algorithm) in mixed else ""
-            cells.append(_score_cell(entry, below, cell_id(i, j), ", ".join(more), code))
-        below_row = "" if len({t.reference for t in results.tasks}) == 1 else REFERENCES[task.reference]
-        rows.append([*row_name(results, task, below_row), *(_best(cells) if ranked else cells)])
+            cells.append(
+                dataclasses.replace(score_cell(entry, ", ".join(more), code), below=below, detail=cell_id(i, j))
+            )
+        rows.append([*row_name(results, task, scored=True), *(_best(cells) if ranked else cells)])
     has_paper_numbers = any(cell.below for row in rows for cell in row[2:])
     return Table(
         "scores",
@@ -83,13 +89,19 @@ def score_table(results: Results) -> Table:
     )
 
 
-def row_name(results: Results, task: Task, more: str = "") -> list[Cell]:
-    """Return level and environment as a row's name, with dataset or content where the name is ambiguous."""
+def row_name(results: Results, task: Task, *, scored: bool = False) -> list[Cell]:
+    """Return level and environment as a row's name, with dataset or content where the name is ambiguous.
+
+    Args:
+        scored: name what the row's scores are normalized by, too, if rows differ in it.
+    """
     env, level = task.env_and_level
     namesakes = {other.dataset for other in results.tasks if other.env_and_level == task.env_and_level}
     apart = task.name if len(namesakes) > 1 else task.content[:DIGITS] if task.ambiguous else ""
-    below = [task.dataset if apart != task.name else "", more]
-    return [Cell(level or "-"), Cell(env, below=" · ".join(filter(None, below)), more=apart)]
+    several = scored and len({other.reference for other in results.tasks}) > 1
+    more = [apart, REFERENCES[task.reference] if several else ""]
+    below = task.dataset if apart != task.name else ""
+    return [Cell(level or "-"), Cell(env, below=below, more=", ".join(filter(None, more)))]
 
 
 def cell_id(task: int, method: int) -> str:
@@ -106,11 +118,22 @@ def column_steps(entries: Sequence[Entry]) -> str:
     return f"{done:,} steps" if done >= of else f"{done:,} of {of:,} steps"
 
 
-def _score_cell(entry: Entry, below: str, detail: str, more: str, code: str) -> Cell:
+def score_cell(entry: Entry, more: str, code: str = "") -> Cell:
+    """Return mean and deviation of an entry's scores, marked if training is not finished or diverged."""
     score = mean_std(entry.scores)
-    marks = [mark for state, mark in (("unfinished", " †"), ("diverged", " ‡")) if state in entry.states]
-    text = plus_minus(score) + "".join(marks) + code
-    return Cell(text if entry.task.reference else f"return {text}", score[0], below, detail=detail, more=more)
+    text = plus_minus(score) + marks(entry.states) + code
+    return Cell(text if entry.task.reference else f"return {text}", score[0], more=more)
+
+
+def marks(states: Collection[str]) -> str:
+    """Return the marks of unfinished and diverged runs that follow a number."""
+    return "".join(mark for state, mark in MARKS.items() if state in states)
+
+
+def mark_notes(entries: Iterable[Entry]) -> list[str]:
+    """Return a note for each mark that the numbers of these entries have."""
+    states = set[str]().union(*(entry.states for entry in entries))
+    return [note for state, note in MARK_NOTES.items() if state in states]
 
 
 def _best(cells: Sequence[Cell]) -> list[Cell]:
@@ -136,15 +159,10 @@ def _score_notes(results: Results, seeds: set[int], has_paper_numbers: bool) -> 
             "In a row whose cells name their evaluations, the scores are of evaluations at different steps: they "
             "cannot be compared, and none is in bold."
         )
-    if left_out := unnamed_settings(results.methods):
-        notes.append(f"Settings that differ from the defaults: {'; '.join(left_out)}.")
+    notes += settings_notes(results.methods)
     if has_paper_numbers:
-        notes.append(f"“paper”: {PAPER} (5 seeds, 1M steps). {DIFFERENT_DATA}")
-    states = set().union(*(entry.states for entry in entries))
-    if "diverged" in states:
-        notes.insert(1, "‡ a run became NaN or infinite and stopped: the number is of its evaluations before that.")
-    if "unfinished" in states:
-        notes.insert(1, "† training is not finished: the number is of the steps done so far and may still change.")
+        notes.append(f"“paper” (on the page only): {PAPER} (its settings, 5 seeds, 1M steps). {DIFFERENT_DATA}")
+    notes[1:1] = mark_notes(entries)
     if mixed_code(entries):
         notes.insert(
             1, "§ the algorithm's runs in this row were trained by different code, as their config.json says."
@@ -160,6 +178,12 @@ def _score_notes(results: Results, seeds: set[int], has_paper_numbers: bool) -> 
             "in brackets, tell them apart."
         )
     return notes
+
+
+def settings_notes(methods: Sequence[Method]) -> list[str]:
+    """Return a note with the settings that the names of the methods leave out; [] if there are none."""
+    left_out = unnamed_settings(methods)
+    return [f"Settings that differ from the defaults: {'; '.join(left_out)}."] if left_out else []
 
 
 def _environments_with_several_references(entries: Sequence[Entry]) -> list[str]:
@@ -202,15 +226,20 @@ def beside_table(results: Results) -> Table | None:
     rows = []
     for entry, published_scores in pairs:
         ours = [entry.mean_std(reference) for reference in ("dataset", "d4rl")]
-        cells = [Cell(plus_minus(pair), pair[0]) if pair else EMPTY for pair in ours]
+        cells = [Cell(plus_minus(pair) + marks(entry.states), pair[0]) if pair else EMPTY for pair in ours]
         cells += [
             Cell(text, float(text.split()[0])) if (text := published_scores.get(source)) else EMPTY
             for source in sources
         ]
-        rows.append([*row_name(results, entry.task), Cell(entry.method.label), *cells])
+        rows.append([*row_name(results, entry.task), Cell(entry.method.label, more=column_steps([entry])), *cells])
     header = ["level", "environment", "method", "ours", "ours", *[source for source, _ in sources]]
     small = ["", "", "", "own reference", "D4RL's constants", *[protocol for _, protocol in sources]]
-    notes = [DIFFERENT_DATA, "The deviations of published scores are those of their sources."]
+    notes = [
+        DIFFERENT_DATA,
+        "The deviations of published scores are those of their sources, and so are the settings.",
+        *settings_notes(results.methods),
+        *mark_notes(entry for entry, _ in pairs),
+    ]
     return Table("beside", "Our scores and published scores", header, rows, notes, 3, small)
 
 
@@ -227,7 +256,10 @@ def iqm_table(results: Results, iqms: Aggregates) -> Table:
         runs = sum(len(values) for values in scores.values())
         numbers = [Cell("-" if end is None else f"{end:.1f}", end) for end in (estimate.low, estimate.high)]
         counts = [Cell(f"{count}", count) for count in (len(scores), runs)]
-        rows.append([Cell(method.label), Cell(f"{estimate.value:.1f}", estimate.value), *numbers, *counts])
+        states = set[str]().union(*(entry.states for entry in results.of(method)))
+        rows.append(
+            [Cell(method.label), Cell(f"{estimate.value:.1f}{marks(states)}", estimate.value), *numbers, *counts]
+        )
     notes = [
         "Interquartile mean of the normalized scores of all runs of all tasks (the mean without the lowest and "
         "highest quarter), and its 95% interval by stratified bootstrap: seeds are resampled within each "
@@ -242,6 +274,7 @@ def iqm_table(results: Results, iqms: Aggregates) -> Table:
         )
     if len({task.reference for task in results.tasks if task.reference}) > 1:
         notes.append("The tasks' scores are normalized by different references (the table of scores says which).")
+    notes += mark_notes(entry for method in iqms for entry in results.of(method))
     header = ["method", "IQM", "95% low", "95% high", "tasks", "runs"]
     return Table("iqm", "Interquartile mean over tasks", header, rows, notes)
 

@@ -303,8 +303,8 @@ def _short(value: object) -> object:
 def find_runs(root: Path) -> list[Run]:
     """Return all runs below a folder in the order of their paths, those with an unreadable config.json included.
 
-    A folder that this user may not read counts as a run that cannot be read. The config.json files of other programs
-    are ignored.
+    Links are followed, and each folder is visited once. A folder that this user may not read counts as a run that
+    cannot be read. The config.json files of other programs are ignored.
     """
     unreadable_folders: list[Path] = []
 
@@ -312,8 +312,14 @@ def find_runs(root: Path) -> list[Run]:
         if not isinstance(error, FileNotFoundError | NotADirectoryError):
             unreadable_folders.append(Path(error.filename))
 
-    walk = os.walk(root, onerror=unreadable)
-    paths = sorted(Path(folder) / "config.json" for folder, _, files in walk if "config.json" in files)
+    visited, paths = set[str](), []
+    for folder, subfolders, files in os.walk(root, onerror=unreadable, followlinks=True):
+        if (real := os.path.realpath(folder)) in visited:
+            subfolders.clear()  # a link to a folder that another path leads to
+        elif "config.json" in files:
+            paths.append(Path(folder) / "config.json")
+        visited.add(real)
+    paths.sort()
     return [*(Run(path.parent) for path in paths if _is_run(path)), *map(Run, unreadable_folders)]
 
 

@@ -75,6 +75,12 @@ def test_similarity_on_the_command_line(medium: str, capsys: pytest.CaptureFixtu
     out = capsys.readouterr().out
     assert out.count("by Q") == out.count("by action") == 2
     assert all(folder in out for folder in folders)
+    (bc,) = offbench.train("bc", medium, steps=20, **SMALL)
+    main(["evaluate", str(bc), folders[0], "--similarity", "--tolerance", "0"])
+    out, err = capsys.readouterr()
+    assert folders[0] in out
+    assert "(within 0% of |Q1(s, a)|)" in out
+    assert f"left out: {bc}: bc has no critic" in " ".join(err.split())
 
 
 def test_similarity_needs_a_critic_and_its_dataset(tiny: tuple[str, str], medium: str) -> None:

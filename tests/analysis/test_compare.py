@@ -113,6 +113,16 @@ def test_a_variant_may_be_named_as_tables_name_it(home: Path) -> None:
         compare("cql", "td3_bc", runs="runs")
 
 
+def test_settings_that_a_name_leaves_out_are_noted(home: Path) -> None:
+    scores(home / "runs", "td3_bc", [51.0, 52.0], variant="alpha=10")
+    scores(home / "runs", "cql", [50.0, 50.0])
+    found = compare("td3_bc", "cql")
+    assert found.title.startswith("td3_bc against cql")
+    assert "note: settings that differ from the defaults: td3_bc: alpha=10" in found.lines()
+    assert found.row()["settings"] == ["td3_bc: alpha=10"]
+    assert not compare("td3_bc/alpha=10", "cql").row()["unpaired"]
+
+
 @pytest.mark.parametrize(
     ("a", "b", "message"),
     [

@@ -16,9 +16,9 @@ import pytest
 import offbench
 from offbench.analysis.methods import find_method
 from offbench.analysis.results import read_results
-from offbench.benchmarks.benchmark import LocalExecutor, benchmark, shard_of
+from offbench.benchmarks.benchmark import LocalExecutor, benchmark
 from offbench.benchmarks.grid import load_grid, shipped_grids
-from offbench.benchmarks.plan import Plan, prepare
+from offbench.benchmarks.plan import Plan, prepare, shard_of
 from offbench.benchmarks.throughput import Rate, operations
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
@@ -236,11 +236,12 @@ def test_shards_share_the_runs_and_together_are_the_grid(grid: str, home: Path) 
 def test_shares_of_the_papers_grid_are_even_and_leave_none_out(count: int) -> None:
     bench = prepare("paper", workers=1)
     whole = sorted(spec.folder for specs in bench.variants for spec in specs)
-    shares = [[spec.folder for spec in shard_of(bench, (i, count))] for i in range(count)]
+    of_shard = [[spec for share in shard_of(bench, (i, count)) for spec in share] for i in range(count)]
+    shares = [[spec.folder for spec in specs] for specs in of_shard]
     assert sorted(folder for share in shares for folder in share) == whole
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
-    for i in range(count):
-        of_each = Counter((spec.algorithm, spec.variant) for spec in shard_of(bench, (i, count)))
+    for specs in of_shard:
+        of_each = Counter((spec.algorithm, spec.variant) for spec in specs)
         assert len(of_each) == len(bench.variants)  # some of every algorithm
         assert max(of_each.values()) - min(of_each.values()) <= 1
 

@@ -16,7 +16,15 @@ from gymnasium.envs.registration import EnvSpec
 from offbench.common.errors import OffbenchError
 from offbench.data.minari_reader import RecordedEpisode
 from offbench.envs import environments
-from offbench.envs.environments import action_box, box, checked_spec, env_spec, make_env, untrusted_env
+from offbench.envs.environments import (
+    action_box,
+    box,
+    checked_spec,
+    env_spec,
+    make_env,
+    same_environment,
+    untrusted_env,
+)
 from offbench.envs.recipes import d4rl_reference
 from offbench.rollouts.policy import uniform
 from offbench.rollouts.rollouts import ErrorReporting, Rollouts, gathered, scalar_reward
@@ -79,6 +87,28 @@ def test_d4rls_scores_are_of_the_standard_task_alone(changes: dict[str, Any], re
     spec = gym.make("Hopper-v5", **changes).spec
     assert spec is not None
     assert d4rl_reference(spec.to_json()) == reference
+
+
+@pytest.mark.parametrize(
+    ("other", "same"),
+    [
+        (lambda env: env, True),
+        (gym.wrappers.RecordEpisodeStatistics, True),
+        (lambda env: gym.wrappers.ClipReward(env, 0.0, 0.1), False),
+        (lambda env: gym.wrappers.ClipReward(env, 0.0, 0.2), False),
+        (lambda env: gym.wrappers.TimeLimit(env, 5), False),
+    ],
+)
+def test_wrappers_that_change_rewards_or_episodes_make_another_environment(other: Any, same: bool) -> None:
+    plain = gym.make("InvertedPendulum-v5").spec
+    wrapped = other(gym.make("InvertedPendulum-v5", render_mode="rgb_array")).spec
+    assert plain is not None
+    assert same_environment(plain.to_json(), wrapped.to_json()) is same
+    assert same_environment(wrapped.to_json(), wrapped.to_json())
+    clipped = gym.wrappers.ClipReward(gym.make("InvertedPendulum-v5"), 0.0, 0.1).spec
+    assert clipped is not None
+    assert not same_environment(plain.to_json(), clipped.to_json())
+    assert not same_environment(clipped.to_json(), None)
 
 
 def test_wrappers_and_other_namespaces_have_no_d4rl_score() -> None:

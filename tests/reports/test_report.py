@@ -73,9 +73,9 @@ def test_the_score_table_by_hand(home: Path) -> None:
     assert "**70.0 ± ? (1 seed)**" in (home / "out" / "tables" / "scores.md").read_text()
     # D4RL's reference of the made runs is -10 to 190: a return of 70 is 100 * 80 / 200
     beside = {row["method"]: row for row in rows(home / "out" / "tables" / "beside.csv")}
-    assert beside["bdb (adaptive)"]["ours (D4RL's constants)"] == "40.0 ± ?"
+    assert beside["bdb (adaptive) (30,000 steps)"]["ours (D4RL's constants)"] == "40.0 ± ?"
     paper = "BDB paper, Table 1, v0 (5 seeds, mean of last 10 evaluations, 1M steps)"
-    assert beside["bdb (adaptive)"][paper] == "100.16 ± 0.02"
+    assert beside["bdb (adaptive) (30,000 steps)"][paper] == "100.16 ± 0.02"
     page = (home / "out" / "index.html").read_text()
     assert "paper 100.16" in page
     assert ">3 seeds<" in page
@@ -270,8 +270,8 @@ def test_a_real_training(medium: str, home: Path) -> None:
     similarity(folders[0], samples=256, tolerance=5.0)  # a mean of unequal tolerances says nothing
     offbench.report(home / "runs", home / "out")
     ((row),) = rows(home / "out" / "tables" / "similarity.csv")
-    assert row["bdb (beta=0.25)"] == "-"
-    assert row["td3_bc"] == f"{written['q_similar']:.1f} ± ?"
+    assert row["bdb (beta=0.25)"] == "not averaged (tolerance 0.05 and 5)"
+    assert row["td3_bc"] == f"{written['q_similar']:.1f} ± ? (tolerance 0.05)"
     assert "tolerances differ" in (home / "out" / "tables" / "similarity.md").read_text()
     details = [r for r in rows(home / "out" / "tables" / "similarity-details.csv") if "0.25" in r["method"]]
     assert [r["seeds"] for r in details] == ["1", "1"]
@@ -301,7 +301,7 @@ def test_the_paper_is_named_where_its_numbers_are(home: Path) -> None:
     assert "a single seed has no standard deviation" in markdown
     made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
     page = Page(offbench.report(home / "runs", home / "out"))
-    assert "“paper”: BDB paper, Table 1" in page.text
+    assert "“paper” (on the page only): BDB paper, Table 1" in page.text
     assert "Learning curves" in page.text
     assert not [word for word in ("Table 1: ", "Table 2: ", "Figure 4: ") if word in page.text]
 

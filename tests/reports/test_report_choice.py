@@ -9,6 +9,7 @@ import pytest
 import offbench
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
+from offbench.common.files import write_json
 from offbench.reports.report import _stems
 from tests.made_runs import METHODS, made_grid, made_run
 from tests.pages import Page, rows
@@ -68,6 +69,50 @@ def test_the_best_variant_of_a_sweep(home: Path) -> None:
     assert not (home / "out" / "tables" / "best.csv").exists()
 
 
+def test_every_table_says_the_scale_and_the_state_of_its_numbers(home: Path) -> None:
+    """A row names its reference in each format, returns are called so, and † marks unfinished runs."""
+    for dataset, references in {"x-medium-v0": (None, None), "hopper-medium-v0": ([0.0, 100.0], None)}.items():
+        for alpha, value in ((1, 40.0), (2, 70.0)):
+            variant = f"alpha={alpha}"
+            made_run(home / "runs", dataset, "td3_bc", variant, 0, 0, returns={15_000: value}, references=references)
+    offbench.report("runs", "out")
+    tables = home / "out" / "tables"
+    scores = {
+        row["environment"]: row["td3_bc (alpha=2) (15,000 of 30,000 steps)"] for row in rows(tables / "scores.csv")
+    }
+    assert scores == {
+        "hopper (own reference)": "70.0 ± ? †",
+        "x (no reference: raw return)": "return 70.0 ± ? †",
+    }
+    best = {row["environment"]: row["td3_bc"] for row in rows(tables / "best.csv")}
+    assert best == {
+        "hopper (own reference)": "70.0 ± ? † (td3_bc (alpha=2), best of 2)",
+        "x (no reference: raw return)": "return 70.0 ± ? † (td3_bc (alpha=2), best of 2)",
+    }
+    beside = {row["method"]: row["ours (own reference)"] for row in rows(tables / "beside.csv")}
+    assert beside["td3_bc (alpha=2) (15,000 of 30,000 steps)"] == "70.0 ± ? †"
+    iqms = {row["method"]: row["IQM"] for row in rows(tables / "iqm.csv")}
+    assert iqms == {"td3_bc (alpha=1)": "40.0 †", "td3_bc (alpha=2)": "70.0 †"}
+    for name in ("scores", "best", "beside", "iqm"):
+        assert "† training is not finished" in (tables / f"{name}.md").read_text()
+
+
+def test_a_similar_score_of_an_earlier_step_or_of_some_runs_says_so(home: Path) -> None:
+    found = {"step": 10_000, "samples": 2560, "tolerance": 0.05, "action_tolerance": 0.1, "action_similar": 50.0}
+    for seed in range(2):
+        run = made_run(home / "runs", "x-medium-v0", "td3_bc", "default", seed, 0, returns={30_000: 50.0})
+    path = run.folder / "similarity.json"
+    for step, cell in ((30_000, "95.0 ± ? (1 of 2 runs)"), (10_000, "95.0 ± ? (at step 10,000, 1 of 2 runs)")):
+        write_json(path, found | {"q_similar": 95.0, "step": step})
+        offbench.report("runs", "out")
+        ((row),) = rows(home / "out" / "tables" / "similarity.csv")
+        assert row["td3_bc"] == cell
+    write_json(run.folder.with_name("seed-0") / "similarity.json", found | {"q_similar": 97.0, "step": 30_000})
+    offbench.report("runs", "out")
+    ((row),) = rows(home / "out" / "tables" / "similarity.csv")
+    assert row["td3_bc"] == "not averaged (at steps 10,000 and 30,000)"
+
+
 def test_the_papers_names_are_for_the_papers_grid(home: Path) -> None:
     made_grid(home / "runs", seeds=2, levels=1)
     page = Page(offbench.report("runs", "out"))
@@ -78,7 +123,7 @@ def test_the_papers_names_are_for_the_papers_grid(home: Path) -> None:
     assert len(labels) < len(METHODS)
     assert "paper's Table" not in page.text
     assert "paper's Figure" not in page.text
-    assert "“paper”: BDB paper, Table 1" in page.text  # its numbers stay
+    assert "“paper” (on the page only): BDB paper, Table 1" in page.text  # its numbers stay
 
 
 def test_settings_that_names_leave_out_are_said(home: Path) -> None:
