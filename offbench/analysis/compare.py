@@ -16,6 +16,7 @@ from offbench.analysis.results import (
     Task,
     keys_with_mixed_code,
     read_results,
+    unequal_notes,
     window_text,
 )
 from offbench.analysis.statistics import Estimate, Paired, improvement, paired
@@ -51,7 +52,7 @@ class Comparison:
         comparable: whether both runs of each pair are scored over evaluations at the same steps.
         unfinished: how many of the paired runs have not reached their last step, or have diverged.
         changed: the algorithms whose paired runs were trained by different code.
-        settings: for each group whose name leaves out settings that differ from the defaults, these.
+        notes: settings that the groups' names leave out, and in which the runs of one group differ.
     """
 
     a: str
@@ -65,7 +66,7 @@ class Comparison:
     comparable: bool
     unfinished: int
     changed: tuple[str, ...]
-    settings: tuple[str, ...]
+    notes: tuple[str, ...]
 
     def __repr__(self) -> str:
         """Return the verdict."""
@@ -117,8 +118,7 @@ class Comparison:
             )
         if self.unfinished:
             lines.append(f"note: {self.unfinished} of the paired runs did not reach their last step")
-        if self.settings:
-            lines.append(f"note: settings that differ from the defaults: {'; '.join(self.settings)}")
+        lines += [f"note: {text}" for text in self.notes]
         for algorithm in self.changed:
             lines.append(f"note: the runs of {algorithm} were trained by different code")
         if self.unpaired:
@@ -149,7 +149,7 @@ class Comparison:
             "unfinished": self.unfinished,
             "comparable": self.comparable,
             "changed": list(self.changed),
-            "settings": list(self.settings),
+            "notes": list(self.notes),
             "verdict": self.verdict,
         }
 
@@ -179,6 +179,7 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
             "give a --runs folder of one dataset"
         )
     pairs = _scored(both)
+    unnamed = unnamed_settings(group[0].method for group in groups)
     trained = [[one for _, one, _ in both], [other for *_, other in both]]
     return Comparison(
         groups[0][0].method.label,
@@ -192,7 +193,7 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
         comparable(both),
         sum(t.state != "finished" for side in trained for t in side),
         tuple(keys_with_mixed_code((t.config.algorithm, t) for side in trained for t in side)),
-        tuple(unnamed_settings(group[0].method for group in groups)),
+        (*(f"settings of {text}" for text in unnamed), *unequal_notes(entry for group in groups for entry in group)),
     )
 
 

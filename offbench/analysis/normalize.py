@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from offbench.agents.ladder import BEHAVIOUR, folder_of, read_ladder, shipped_ladder
 from offbench.analysis.methods import Method, unnamed_settings
-from offbench.analysis.results import Entry, entries_of, mixed_code, read_results
+from offbench.analysis.results import Entry, entries_of, mixed_code, read_results, unequal_notes
 from offbench.analysis.statistics import iqm
 from offbench.common import scores
 from offbench.common.errors import OffbenchError
@@ -63,7 +63,9 @@ def without_evaluation(runs: str | Path) -> tuple[int, int]:
 def _rows(entries: Collection[Entry]) -> list[Row]:
     ambiguous, mixed = any(entry.task.ambiguous for entry in entries), mixed_code(entries)
     return [
-        _row(entry, ambiguous) | {"one_code": (entry.task, entry.method.algorithm) not in mixed} for entry in entries
+        _row(entry, ambiguous)
+        | {"one_code": (entry.task, entry.method.algorithm) not in mixed, "unequal": "; ".join(unequal_notes([entry]))}
+        for entry in entries
     ]
 
 
@@ -139,6 +141,7 @@ TITLES: dict[str, str | None] = {
     "variant": None,
     "window": None,
     "one_code": None,
+    "unequal": None,
     "of_steps": None,  # shown as 50,000 of 1,000,000 in the steps column
     "score": "score (own ref.)",
     "score_std": None,
@@ -230,6 +233,7 @@ def notes(rows: Sequence[Row]) -> list[str]:
         )
     mixed = dict.fromkeys((row["algorithm"], row["dataset"]) for row in rows if not row.get("one_code", True))
     lines += [f"the runs of {algorithm} on {dataset} were trained by different code" for algorithm, dataset in mixed]
+    lines += [row["unequal"] for row in rows if row.get("unequal")]
     if any("method" in row for row in rows):
         datasets: dict[Method, dict[str, None]] = {}
         for row in rows:

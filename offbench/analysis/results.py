@@ -159,6 +159,17 @@ class Entry:
         windows = {trained.window for trained in self.runs}
         return windows.pop() if len(windows) == 1 else None
 
+    @property
+    def unequal(self) -> list[str]:
+        """In which settings and evaluations its runs differ: `alpha (2.5 and 5.0)`.
+
+        A variant's name has no settings at their defaults, which may have changed between two runs.
+        """
+        values = [t.config.settings | {"eval_episodes": t.config.eval_episodes} for t in self.runs]
+        shared = [name for name in values[0] if all(name in other for other in values)]
+        texts = {name: list(dict.fromkeys(str(settings[name]) for settings in values)) for name in shared}
+        return [f"{name} ({' and '.join(found)})" for name, found in texts.items() if len(found) > 1]
+
     def common_curve(self) -> tuple[list[int], Array]:
         """Return the steps that all runs were evaluated at, and their scores [runs, steps]."""
         curves = [trained.curve(self.task.reference) for trained in self.runs]
@@ -256,6 +267,12 @@ def keys_with_mixed_code(runs: Iterable[tuple[Key, EvaluatedRun]]) -> list[Key]:
 def mixed_code(entries: Iterable[Entry]) -> list[tuple[Task, str]]:
     """Return the tasks and algorithms whose runs, of all variants, were trained by different code."""
     return keys_with_mixed_code(((entry.task, entry.method.algorithm), run) for entry in entries for run in entry.runs)
+
+
+def unequal_notes(entries: Iterable[Entry]) -> list[str]:
+    """Return a note for each entry that averages runs of different settings or evaluations."""
+    found = ((entry, ", ".join(entry.unequal)) for entry in entries)
+    return [f"the runs of {e.method.label} on {e.task.name} differ in {text}" for e, text in found if text]
 
 
 def window_text(runs: Iterable[EvaluatedRun]) -> str:

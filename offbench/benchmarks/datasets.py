@@ -56,7 +56,7 @@ def check_recorded(source: Source) -> None:
         raise OffbenchError(
             f"the local dataset {source.id} does not match the grid: it has {', '.join(differences)}; record it "
             f"again (`offbench collect {shlex.quote(source.env)} --level {source.level}{steps}{seed} --id {source.id} "
-            "--overwrite`), or give another id in the grid"
+            "--overwrite`), or give in the grid another id, or the level, seed and steps of this dataset"
         )
 
 

@@ -58,10 +58,26 @@ CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding cause a war
 
 @dataclass(frozen=True, repr=False)
 class Transitions:
-    """A dataset as flat arrays, memory-mapped from the cache (layout: offbench.data.transitions)."""
+    """A dataset as flat float32 arrays of N transitions in E episodes, memory-mapped read-only from the cache.
+
+    Transition i leads from `observations[rows[i]]` to `observations[rows[i] + 1]` by `actions[i]`. The action that the
+    environment takes is `low + (actions[i] + 1) * (high - low) / 2`.
+
+    Attributes:
+        content: SHA-256 over the arrays, the same as in an offbench dataset's metadata.
+        observations: [N + E, obs], the T + 1 observations of every episode, end to end.
+        rows: [N], the row of each transition's observation.
+        actions: [N, act], scaled from the bounds of the action space to [-1, 1].
+        rewards: [N].
+        masks: [N], 0 where the episode terminated and 1 elsewhere, also at a truncation.
+        ends: [E], the number of transitions up to each episode's end.
+        returns: [E], the sum of each episode's rewards.
+        low, high: [act], the bounds of the action space.
+        evaluated_in: EnvSpec JSON of the environment that the user chose instead of the dataset's.
+    """
 
     dataset_id: str
-    content: str  # SHA-256 over the arrays, the same as in an offbench dataset's metadata
+    content: str
     observations: Array
     rows: Array
     actions: Array
@@ -72,7 +88,7 @@ class Transitions:
     low: Array
     high: Array
     metadata: JsonObject
-    evaluated_in: str | None = None  # EnvSpec JSON: the user's choice instead of the dataset's environment
+    evaluated_in: str | None = None
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -122,7 +138,7 @@ class Transitions:
 
 
 def load(dataset_id: str) -> Transitions:
-    """Return a local Minari dataset as flat arrays.
+    """Return a local Minari dataset as flat arrays, with actions scaled to [-1, 1].
 
     Raises:
         OffbenchError: no such dataset, spaces other than flat Boxes, NaN or infinite numbers, wrong shapes,

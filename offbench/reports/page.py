@@ -153,11 +153,13 @@ def _dialog(results: Results, entry: Entry, name: str) -> Markup:
     facts = {
         "dataset": f"{task.dataset}, content {task.content}",
         "references": "; ".join(references) or "none",
-        "evaluation": f"every {first.eval_every:,} updates, {first.eval_episodes} episodes",
+        "evaluation": _distinct_lines(
+            [f"every {t.config.eval_every:,} updates, {t.config.eval_episodes} episodes" for t in entry.runs]
+        ),
         "commands": _distinct_lines([trained.config.command or "from Python" for trained in entry.runs]),
         "versions": _distinct_lines([_key_values(session.versions) for session in sessions]),
         "hardware": _distinct_lines([_hardware(session) for session in sessions]),
-        "settings": _key_values(first.settings) or "none",
+        "settings": _distinct_lines([_key_values(t.config.settings) or "none" for t in entry.runs]),
     }
     title = f"{entry.method.label} on {task.name}"
     terms = [part for key, text in facts.items() for part in (tag("dt", key), tag("dd", breakable(text)))]

@@ -34,7 +34,8 @@ def best_table(results: Results) -> Table | None:
         return None
     notes = [
         "The variant with the highest mean score. It was selected by the score shown, so this number is "
-        "optimistic, and more so with more variants. To report it, train the selected variant with new seeds.",
+        "optimistic, and more so with more variants. To report it, train the selected variant with new seeds in "
+        "another --runs folder.",
         *mark_notes(shown),
     ]
     return Table("best", "Best variant of each algorithm", ["level", "environment", *algorithms], rows, notes, heads=2)

@@ -157,8 +157,14 @@ class Run:
             if key == "dataset_sha256":
                 what = f"another content of {config.dataset}, which has been recorded again since"
                 return f"{self.folder} was trained on {what}"
-            flag = f"--{key.replace('_', '-')}" if key.startswith("eval") else key
-            return f"{self.folder} was started with {flag} {old}, not {new}"
+            if key == "settings":
+                differ = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+                was = ", ".join(f"{name} {old.get(name)}" for name in differ)
+                return f"{self.folder} was started with {was}, not {', '.join(str(new.get(name)) for name in differ)}"
+            if key.startswith("eval"):
+                flag = f"--{key.replace('_', '-')}"
+                return f"{self.folder} was started with {flag} {old}, not {new} (to continue it, give {flag} {old})"
+            return f"{self.folder} was started with {key} {old}, not {new}"
         changed = changes(existing.code, config.code)
         return f"{self.folder} was trained by other code of {config.algorithm}: {changed}" if changed else ""
 

@@ -5,7 +5,7 @@ A hash leaves out comments, docstrings and blank lines, which do not affect trai
     algorithm of offbench             its file
     algorithm of a package            all files of the package, and the installed version
     algorithm in a user's own file    the file, and the files in its folder that it imports
-    class of a script or notebook     the source of the class, its Config and its bases
+    class of a script or notebook     the class, its Config, its bases, and what they use (see script_code.py)
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import ast
 import functools
 import importlib.metadata
-import inspect
 import io
 import sys
 import tokenize
@@ -24,6 +23,7 @@ from typing import TYPE_CHECKING
 
 from offbench.common.files import sha256
 from offbench.training.registry import load_algorithm, own_algorithm
+from offbench.training.script_code import GLOBAL, script_code
 
 if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
@@ -33,11 +33,10 @@ LEFT_OUT = {tokenize.COMMENT, tokenize.NL, tokenize.ENCODING, tokenize.ENDMARKER
 
 
 def code_of(algorithm: str) -> dict[str, str]:
-    """Return {file: hash} of an algorithm's code, and {"version of PACKAGE": version} of a package's.
-
-    It is empty for a class whose source Python does not know, one that was typed at a prompt.
-    """
+    """Return {file: hash} of an algorithm's code, and {"version of PACKAGE": version} of a package's."""
     algorithm_class = load_algorithm(algorithm)
+    if algorithm_class.__module__ == "__main__":  # what it uses may have been changed since
+        return _code_of(algorithm_class)
     if algorithm_class not in _codes:
         _codes[algorithm_class] = _code_of(algorithm_class)
     return _codes[algorithm_class]
@@ -50,7 +49,7 @@ def _code_of(algorithm_class: type[Algorithm]) -> dict[str, str]:
         file = Path(getattr(module, "__file__", None) or "")
         package = cls.__module__.partition(".")[0]
         if cls.__module__ == "__main__" or not file.is_file():
-            hashes |= {one.__qualname__: text for one in (cls, algorithm_class.Config) if (text := _source_hash(one))}
+            hashes |= script_code([cls, algorithm_class.Config], _source, _beside)
         elif package == "offbench":
             hashes[file.name] = _hash(file)
         elif folders := getattr(sys.modules[package], "__path__", None):  # several of a namespace package
@@ -62,6 +61,11 @@ def _code_of(algorithm_class: type[Algorithm]) -> dict[str, str]:
             hashes |= {str(path.relative_to(file.parent)): _hash(path) for path in {file: None, **files}}
             hashes |= _version(package)
     return dict(sorted(hashes.items()))
+
+
+def _beside(file: Path) -> dict[str, str]:
+    """Return the hashes of a file beside a script, and of the files that it imports."""
+    return {str(path.relative_to(file.parent)): _hash(path) for path in _imported(file, file.parent, {})}
 
 
 def _classes(algorithm_class: type[Algorithm]) -> Sequence[type]:
@@ -89,6 +93,8 @@ def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     if not set(before) & set(now):
         return f"{', '.join(before)}, not {', '.join(now)}"
     differ = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    if not any(name.startswith(GLOBAL) for name in before):  # of an earlier version, which did not record them
+        differ = [name for name in differ if not name.startswith(GLOBAL)]
     return ", ".join(f"{name} {_describe_change(before.get(name), now.get(name))}" for name in differ)
 
 
@@ -116,13 +122,6 @@ def _installed_with(module: str, folder: Path) -> dict[Path, None]:
     distributions = [importlib.metadata.distribution(name) for name in _distributions().get(module, [])]
     paths = [Path(str(one.locate_file(file))) for one in distributions for file in one.files or ()]
     return {path: None for path in paths if path.suffix == ".py" and folder in path.parents and path.is_file()}
-
-
-def _source_hash(cls: type) -> str:
-    try:
-        return _source(inspect.cleandoc("\n" + inspect.getsource(cls)))
-    except (OSError, TypeError, SyntaxError):
-        return ""
 
 
 def _imported(file: Path, root: Path, seen: dict[Path, None]) -> dict[Path, None]:

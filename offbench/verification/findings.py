@@ -91,6 +91,10 @@ class Findings:
         assert code in FAULTS, code
         self._seen.setdefault(code, []).append((where, detail))
 
+    def withdraw(self, code: str) -> bool:
+        """Remove all occurrences of a fault; return whether there were any."""
+        return self._seen.pop(code, None) is not None
+
     def all(self) -> tuple[Finding, ...]:
         """Return the findings in the order of FAULTS."""
         return tuple(self._finding(code) for code in FAULTS if code in self._seen)

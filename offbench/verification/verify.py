@@ -212,6 +212,12 @@ def _add_replays(replays: Sequence[ReplayResult], mujoco: str | None, report: Re
     if left:
         text = f"playing {counted(left, 'episode')} again"
         report.skipped.append(f"{text}: no seed, and no state to be set from observations")
+    faultless = replays and not any(replay.faults or replay.how == "none" for replay in replays)
+    if faultless and findings.withdraw("clipped-actions"):
+        report.warnings.append(
+            "many actions are equal to their least or greatest value inside the bounds; the environment executed them "
+            "(the episodes played again show it), so these are limits of the behaviour policy"
+        )
     for replay in replays:
         for code, detail in replay.faults:
             findings.add(code, f"episode {replay.index}", detail)

@@ -118,9 +118,23 @@ def test_settings_that_a_name_leaves_out_are_noted(home: Path) -> None:
     scores(home / "runs", "cql", [50.0, 50.0])
     found = compare("td3_bc", "cql")
     assert found.title.startswith("td3_bc against cql")
-    assert "note: settings that differ from the defaults: td3_bc: alpha=10" in found.lines()
-    assert found.row()["settings"] == ["td3_bc: alpha=10"]
+    assert "note: settings of td3_bc: alpha=10" in found.lines()
+    assert found.row()["notes"] == ["settings of td3_bc: alpha=10"]
     assert not compare("td3_bc/alpha=10", "cql").row()["unpaired"]
+
+
+def test_runs_of_different_settings_in_one_variant_are_said(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As after an edit of a default, which no variant's name has: seeds 0 and 1 are not the same method."""
+    for seed, alpha in enumerate((2.5, 5.0)):
+        settings = {"alpha": alpha, "hidden": [8]}
+        made_run(home / "runs", "x-medium-v0", "td3_bc", "default", seed, 50, settings=settings)
+    note = "the runs of td3_bc on x-medium-v0 differ in alpha (2.5 and 5.0)"
+    main(["normalize"])
+    assert note in " ".join(capsys.readouterr().out.split())
+    offbench.report("runs", "out")
+    assert note in (home / "out" / "tables" / "scores.md").read_text().replace("\\", "")
+    scores(home / "runs", "cql", [50.0, 50.0], "x-medium-v0")
+    assert f"note: {note}" in compare("td3_bc", "cql").lines()
 
 
 @pytest.mark.parametrize(

@@ -188,6 +188,21 @@ def test_a_function_of_ones_own(home: Path, tiny: tuple[str, str], monkeypatch: 
         offbench.collect(recipe, policy="my_policy_module:act", name="medium", **more)
 
 
+def test_a_controller_with_limits_of_its_own_verifies(
+    home: Path, tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its actions are cut off inside the bounds of ±3, and executed so: no fault, which replaying them shows."""
+    (home / "limited.py").write_text("def act(o):\n    return [max(-0.3, min(0.3, 9 * o[1]))]\n")
+    monkeypatch.syspath_prepend(str(home))
+    recipe, behaviour_dir = tiny
+    dataset = offbench.collect(
+        recipe, policy="limited:act", name="limited", steps=400, behaviour_dir=behaviour_dir, workers=1
+    )
+    report = offbench.verify(dataset)
+    assert report.ok
+    assert "these are limits of the behaviour policy" in report.warnings[0]
+
+
 POLICIES = """
 import functools
 

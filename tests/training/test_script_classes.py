@@ -1,0 +1,128 @@
+"""Algorithms that are classes of a script or a notebook: an edit of what they use is noticed, other edits are not."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+import offbench
+from offbench.common.errors import OffbenchError
+from offbench.training import registry
+from offbench.training.source_code import code_of
+
+SCRIPT = """
+from offbench.algos.bc import BC
+from offbench.training.source_code import code_of
+from offbench.training.registry import register
+import helper
+from helper import halved
+
+SCALE = 2.0
+steps = 20
+
+def doubled(value):
+    return weighted(value) * SCALE
+
+def weighted(value):
+    return 3.0 * value
+
+def unused():
+    return 1
+
+class Mine(BC):
+    limit = SCALE
+
+    def policy(self, run):
+        self.steps = 1
+        return halved(doubled(super().policy(run)))
+
+code = code_of(register(Mine))
+"""
+HELPER = "import parts\ndef halved(value):\n    return value * parts.HALF\n"
+
+
+@pytest.fixture(autouse=True)
+def _forget(monkeypatch: pytest.MonkeyPatch, home: Path) -> None:
+    """Forget the classes and modules of each test."""
+    monkeypatch.setattr(registry, "_own", {})
+    monkeypatch.syspath_prepend(str(home))
+    for name in ("helper", "parts"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+
+
+def of_script(home: Path, script: str, half: str = "HALF = 0.5\n") -> dict[str, str]:
+    (home / "script.py").write_text(script)
+    (home / "helper.py").write_text(HELPER)
+    (home / "parts.py").write_text(half)
+    registry._own.clear()
+    for name in ("helper", "parts"):
+        sys.modules.pop(name, None)
+    code: dict[str, str] = runpy.run_path("script.py", run_name="__main__")["code"]
+    return code
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "changed"),
+    [
+        ("SCALE = 2.0", "SCALE = 4.0", {"global SCALE", "global Mine.limit"}),
+        ("3.0 * value", "5.0 * value", {"global weighted"}),
+        ("self.steps = 1", "self.steps = 2", {"Mine"}),
+        ("steps = 20", "steps = 40", set()),
+        ("return 1", "return 2", set()),
+        ("def unused", "# a comment\ndef unused", set()),
+    ],
+)
+def test_an_edit_of_what_a_scripts_class_uses_is_noticed(home: Path, old: str, new: str, changed: set[str]) -> None:
+    before, now = of_script(home, SCRIPT), of_script(home, SCRIPT.replace(old, new))
+    assert {"Mine", "bc.py", "global doubled", "helper.py", "parts.py"} <= before.keys()
+    assert {name for name in {**before, **now} if before.get(name) != now.get(name)} == changed
+
+
+def test_an_edit_of_a_file_beside_a_script_is_noticed(home: Path) -> None:
+    before, now = of_script(home, SCRIPT), of_script(home, SCRIPT, "HALF = 0.25\n")
+    assert {name for name in before if before[name] != now[name]} == {"parts.py"}
+
+
+CELL = """
+import dataclasses
+from offbench.algos.td3_bc import TD3BC, Config
+
+WEIGHT = 1.0
+
+def weighed(loss):
+    return WEIGHT * loss
+
+class Mine(TD3BC):
+    def policy(self, run):
+        weighed(1.0)
+        return super().policy(run)
+"""
+
+
+def test_an_edited_cell_of_a_notebook_is_noticed(home: Path, medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The source of a cell is not in a file; what was trained with the cell before is not continued."""
+    notebook = types.ModuleType("__main__")
+    monkeypatch.setitem(sys.modules, "__main__", notebook)
+
+    def train(cell: str, steps: int = 20) -> None:
+        exec(cell, vars(notebook))
+        registry._own.clear()
+        small = {"hidden": (8,), "batch_size": 8, "eval_every": 10, "eval_episodes": 1, "workers": 1}
+        offbench.train(vars(notebook)["Mine"], medium, steps=steps, **small)
+
+    train(CELL)
+    first = code_of("Mine")
+    assert {"Mine", "td3_bc.py", "global weighed", "global WEIGHT"} <= first.keys()
+    train(CELL.replace("WEIGHT = 1.0", "WEIGHT = 1.0  # a comment"), steps=30)
+    for old, new, name in (
+        ("WEIGHT = 1.0", "WEIGHT = 2.0", "global WEIGHT"),
+        ("WEIGHT * loss", "WEIGHT * loss * 2", "global weighed"),
+        ("weighed(1.0)", "weighed(2.0)", "Mine"),
+    ):
+        with pytest.raises(OffbenchError, match=f"trained by other code of Mine: {name} has changed"):
+            train(CELL.replace(old, new), steps=30)
+    train(CELL, steps=40)
