@@ -45,7 +45,7 @@ def similarity_tables(results: Results) -> list[Table]:
         "Percent of sampled transitions on which the policy's action counts as the dataset's, mean ± standard "
         "deviation over seeds: |Q1(s, π(s)) - Q1(s, a)| at most the tolerance times |Q1(s, a)|. The paper gives no "
         "formula; this reading of its Table 2 is ours."
-        + (" “paper”: its printed number, on D4RL's v0 datasets." if has_paper_numbers else "")
+        + (" “paper” (on the page only): its printed number, on D4RL's v0 datasets." if has_paper_numbers else "")
     ]
     if differ:
         notes.append(
