@@ -35,7 +35,7 @@ def score_runs(runs: str | Path = "runs") -> list[Row]:
     interquartile mean of `score` with its 95% bootstrap interval (`iqm`, in JSON and CSV). Only if one id stands for
     several contents, rows have the first digits of the content's hash (`content`). `window` (in JSON and CSV) has the
     steps of the evaluations behind the scores, and is empty if they differ between seeds: only scores of one window
-    compare.
+    compare. `unequal` (in JSON and CSV) says in which settings the runs of a row differ.
 
     Raises:
         OffbenchError: the folder holds no evaluated run. Damaged ones are named on stderr and left out.

@@ -150,7 +150,7 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
 
     def run(paths: list[str], similarity: bool, **arguments: Any) -> None:
         given = {name: value for name, value in arguments.items() if value is not None and value is not False}
-        for name in given.keys() & (OF_EPISODES if similarity else OF_SIMILARITY):
+        for name in sorted(given.keys() & (OF_EPISODES if similarity else OF_SIMILARITY)):
             which = "with" if similarity else "without"
             raise OffbenchError(f"--{name.replace('_', '-')} has no effect {which} --similarity; leave it out")
         if similarity:

@@ -167,7 +167,7 @@ def _score_notes(results: Results, seeds: set[int], has_paper_numbers: bool) -> 
         notes.insert(
             1, "§ the algorithm's runs in this row were trained by different code, as their config.json says."
         )
-    notes += [f"Not averaged alike: {text}." for text in unequal_notes(entries)]
+    notes += [f"{text[0].upper()}{text[1:]}." for text in unequal_notes(entries)]
     if several := _environments_with_several_references(entries):
         notes.append(
             f"The datasets of {', '.join(several)} were recorded with different references: their scores are on "
