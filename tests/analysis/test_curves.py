@@ -1,4 +1,4 @@
-"""Learning curves as pictures show them."""
+"""Learning curves as pictures show them, the scores of one policy, and what recipes are scored by."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from offbench.analysis.results import LONG_CURVE, read_results
+from offbench.envs.recipes import load_recipe
+from offbench.evaluation.evaluate import Evaluation
+from offbench.reports.figures import iqm_curve_figure, line_styles
 from tests.made_runs import made_run
 
 
@@ -33,3 +36,34 @@ def test_a_short_curve_shows_each_evaluation() -> None:
     (entry,) = read_results("runs").entries.values()
     assert 0 < len(entry.common_curve()[0]) <= LONG_CURVE
     assert np.array_equal(entry.drawn_curve()[1], entry.common_curve()[1])
+
+
+def test_the_curve_over_all_tasks_has_the_last_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 100 evaluations some are left out, but not the last; the caption names the means."""
+    shown: list[list[int]] = []
+    monkeypatch.setattr("offbench.reports.figures._band", lambda _, steps, *__: shown.append(list(steps)))
+    returns = dict.fromkeys(range(5_000, 500_001, 5_000), 50.0)
+    made_run(Path("runs"), "hopper-medium-v0", "td3_bc", "default", 0, 0, steps=500_000, returns=returns)
+    results = read_results("runs")
+    figure = iqm_curve_figure(results, line_styles(results.methods))
+    assert figure is not None
+    assert {steps[-1] for steps in shown} == {500_000}
+    assert 20 < len(shown[0]) <= 50
+    assert "Each point is the mean of the last 10 evaluations" in figure.caption
+
+
+def test_one_episode_has_no_interval() -> None:
+    one = Evaluation("policy", "Hopper-v5", [742.1], [200], {})
+    assert one.lines()[1] == "return 742.1, length 200"
+    two = Evaluation("policy", "Hopper-v5", [700.0, 800.0], [200, 220], {})
+    assert "std 70.7, length 210" in two.lines()[1]  # sqrt(2 * 50^2 / (2 - 1))
+
+
+def test_a_recipe_that_changes_d4rls_task_has_no_score_by_its_constants(home: Path) -> None:
+    text = 'env_id = "Hopper-v5"\nd4rl_min = -20.3\nd4rl_max = 3234.3\n'
+    (home / "plain.toml").write_text(text)
+    (home / "changed.toml").write_text(text + "[env_kwargs]\nforward_reward_weight = 9.0\n")
+    (home / "other.toml").write_text(text.replace("Hopper-v5", "Reacher-v5"))
+    assert load_recipe("./plain.toml").d4rl_reference() == load_recipe("hopper").d4rl_reference()
+    assert load_recipe("./changed.toml").d4rl_reference() is None
+    assert load_recipe("./other.toml").d4rl_reference() == (-20.3, 3234.3)

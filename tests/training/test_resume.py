@@ -256,7 +256,7 @@ def test_a_run_whose_files_were_deleted_is_not_taken_for_another(medium: str) ->
 
 def test_a_refused_command_makes_no_run_folder(medium: str) -> None:
     train("td3_bc", medium, "runs", 100)
-    with pytest.raises(OffbenchError, match="was started with --eval-every 100, not 50"):
+    with pytest.raises(OffbenchError, match=r"--eval-every 100, not 50 \(to continue it, give --eval-every 100\)"):
         train("td3_bc", medium, "runs", 100, seeds=[1, 0], eval_every=50)
     assert len(find_runs(Path("runs"))) == 1
 
