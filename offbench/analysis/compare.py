@@ -14,9 +14,9 @@ from offbench.analysis.results import (
     Entry,
     EvaluatedRun,
     Task,
+    differing_settings_notes,
     keys_with_mixed_code,
     read_results,
-    unequal_notes,
     window_text,
 )
 from offbench.analysis.statistics import Estimate, Paired, improvement, paired
@@ -193,7 +193,10 @@ def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
         comparable(both),
         sum(t.state != "finished" for side in trained for t in side),
         tuple(keys_with_mixed_code((t.config.algorithm, t) for side in trained for t in side)),
-        (*(f"settings of {text}" for text in unnamed), *unequal_notes(entry for group in groups for entry in group)),
+        (
+            *(f"settings of {text}" for text in unnamed),
+            *differing_settings_notes(entry for group in groups for entry in group),
+        ),
     )
 
 

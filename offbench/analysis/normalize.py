@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from offbench.agents.ladder import BEHAVIOUR, folder_of, read_ladder, shipped_ladder
 from offbench.analysis.methods import Method, unnamed_settings
-from offbench.analysis.results import Entry, entries_of, mixed_code, read_results, unequal_notes
+from offbench.analysis.results import Entry, differing_settings_notes, entries_of, mixed_code, read_results
 from offbench.analysis.statistics import iqm
 from offbench.common import scores
 from offbench.common.errors import OffbenchError
@@ -35,7 +35,7 @@ def score_runs(runs: str | Path = "runs") -> list[Row]:
     interquartile mean of `score` with its 95% bootstrap interval (`iqm`, in JSON and CSV). Only if one id stands for
     several contents, rows have the first digits of the content's hash (`content`). `window` (in JSON and CSV) has the
     steps of the evaluations behind the scores, and is empty if they differ between seeds: only scores of one window
-    compare. `unequal` (in JSON and CSV) says in which settings the runs of a row differ.
+    compare. `differing_settings` (in JSON and CSV) says in which settings the runs of a row differ.
 
     Raises:
         OffbenchError: the folder holds no evaluated run. Damaged ones are named on stderr and left out.
@@ -64,7 +64,10 @@ def _rows(entries: Collection[Entry]) -> list[Row]:
     ambiguous, mixed = any(entry.task.ambiguous for entry in entries), mixed_code(entries)
     return [
         _row(entry, ambiguous)
-        | {"one_code": (entry.task, entry.method.algorithm) not in mixed, "unequal": "; ".join(unequal_notes([entry]))}
+        | {
+            "one_code": (entry.task, entry.method.algorithm) not in mixed,
+            "differing_settings": "; ".join(differing_settings_notes([entry])),
+        }
         for entry in entries
     ]
 
@@ -141,7 +144,7 @@ TITLES: dict[str, str | None] = {
     "variant": None,
     "window": None,
     "one_code": None,
-    "unequal": None,
+    "differing_settings": None,
     "of_steps": None,  # shown as 50,000 of 1,000,000 in the steps column
     "score": "score (own ref.)",
     "score_std": None,
@@ -233,7 +236,7 @@ def notes(rows: Sequence[Row]) -> list[str]:
         )
     mixed = dict.fromkeys((row["algorithm"], row["dataset"]) for row in rows if not row.get("one_code", True))
     lines += [f"the runs of {algorithm} on {dataset} were trained by different code" for algorithm, dataset in mixed]
-    lines += [row["unequal"] for row in rows if row.get("unequal")]
+    lines += [row["differing_settings"] for row in rows if row.get("differing_settings")]
     if any("method" in row for row in rows):
         datasets: dict[Method, dict[str, None]] = {}
         for row in rows:

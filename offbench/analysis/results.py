@@ -160,7 +160,7 @@ class Entry:
         return windows.pop() if len(windows) == 1 else None
 
     @property
-    def unequal(self) -> list[str]:
+    def differing_settings(self) -> list[str]:
         """In which settings and evaluations its runs differ: `alpha (2.5 and 5.0)`.
 
         A variant's name has no settings at their defaults, which may have changed between two runs.
@@ -269,9 +269,9 @@ def mixed_code(entries: Iterable[Entry]) -> list[tuple[Task, str]]:
     return keys_with_mixed_code(((entry.task, entry.method.algorithm), run) for entry in entries for run in entry.runs)
 
 
-def unequal_notes(entries: Iterable[Entry]) -> list[str]:
+def differing_settings_notes(entries: Iterable[Entry]) -> list[str]:
     """Return a note for each entry that averages runs of different settings or evaluations."""
-    found = ((entry, ", ".join(entry.unequal)) for entry in entries)
+    found = ((entry, ", ".join(entry.differing_settings)) for entry in entries)
     return [f"the runs of {e.method.label} on {e.task.name} differ in {text}" for e, text in found if text]
 
 

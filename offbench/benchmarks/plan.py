@@ -149,8 +149,8 @@ class Plan:
             "run": sum(map(len, bench.variants)),
         }
         text = ", ".join(counted(size, noun) for noun, size in sizes.items())
-        share = f" by shard {index}/{count}" if count > 1 else ""
-        yield f"{bench.grid.name}: {text}, {sum(map(len, left))} to train{share}"
+        by_shard = f" by shard {index}/{count}" if count > 1 else ""
+        yield f"{bench.grid.name}: {text}, {sum(map(len, left))} to train{by_shard}"
         if longer:
             yield f"  left as they are: {counted(longer, 'run')} with more updates than the grid's steps"
         if not any(left):

@@ -23,8 +23,8 @@ from offbench.common.files import JsonObject
 from offbench.common.terminal import is_terminal, note, print_line, print_lines, print_table
 from offbench.common.text import counted
 
-OF_EPISODES = {"env", "episodes", "stochastic", "workers"}  # options of `evaluate` without --similarity
-OF_SIMILARITY = {"algorithm", "tolerance", "action_tolerance"}  # and with it
+EPISODE_OPTIONS = {"env", "episodes", "stochastic", "workers"}  # options of `evaluate` without --similarity
+SIMILARITY_OPTIONS = {"algorithm", "tolerance", "action_tolerance"}  # and with it
 RUNS_HELP = "folder of the runs (default: runs)"
 
 
@@ -150,7 +150,7 @@ def evaluate_arguments(parser: Parser, _: list[str]) -> None:
 
     def run(paths: list[str], similarity: bool, **arguments: Any) -> None:
         given = {name: value for name, value in arguments.items() if value is not None and value is not False}
-        for name in sorted(given.keys() & (OF_EPISODES if similarity else OF_SIMILARITY)):
+        for name in sorted(given.keys() & (EPISODE_OPTIONS if similarity else SIMILARITY_OPTIONS)):
             which = "with" if similarity else "without"
             raise OffbenchError(f"--{name.replace('_', '-')} has no effect {which} --similarity; leave it out")
         if similarity:

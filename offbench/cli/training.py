@@ -19,7 +19,8 @@ from offbench.cli.arguments import (
     shard,
 )
 from offbench.cli.results import print_scores
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import OffbenchError, unknown
+from offbench.common.settings import fields
 from offbench.common.terminal import hint, note, print_lines
 from offbench.common.text import without_steps
 
@@ -74,10 +75,10 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
         rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
         rest["algorithm"], settings = algorithm, named | settings
-        for key in RESERVED_SETTINGS & named.keys():
-            if key != "precision":
-                raise OffbenchError(f"no setting of {algorithm} is called {key}: give --{key}, not {words[0]!r}")
-            (rest[key],) = settings.pop(key)
+        if "precision" in named:  # which is in the names of methods, but no setting
+            (rest["precision"],) = settings.pop("precision")
+        if reserved := RESERVED_SETTINGS & settings.keys():
+            raise unknown(f"setting of {algorithm}", min(reserved), fields(config))
         if moved:
             note(f"{moved} is an option of bdb_plus, no longer of bdb: training bdb_plus")
         kept = [word for word in words if word != "--fresh"]  # whoever repeats the command resumes

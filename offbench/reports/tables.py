@@ -10,7 +10,15 @@ from typing import TypeAlias
 
 from offbench.analysis.compare import comparable, differences, favored, pair_runs
 from offbench.analysis.methods import Method, unnamed_settings
-from offbench.analysis.results import REFERENCES, Entry, Results, Task, mixed_code, unequal_notes, window_text
+from offbench.analysis.results import (
+    REFERENCES,
+    Entry,
+    Results,
+    Task,
+    differing_settings_notes,
+    mixed_code,
+    window_text,
+)
 from offbench.analysis.statistics import Estimate, Scores, improvement, iqm, paired
 from offbench.common.scores import SCORED_EVALUATIONS, mean_std, plus_minus
 from offbench.common.tables import Cell, Table
@@ -167,7 +175,7 @@ def _score_notes(results: Results, seeds: set[int], has_paper_numbers: bool) -> 
         notes.insert(
             1, "§ the algorithm's runs in this row were trained by different code, as their config.json says."
         )
-    notes += [f"{text[0].upper()}{text[1:]}." for text in unequal_notes(entries)]
+    notes += [f"{text[0].upper()}{text[1:]}." for text in differing_settings_notes(entries)]
     if several := _environments_with_several_references(entries):
         notes.append(
             f"The datasets of {', '.join(several)} were recorded with different references: their scores are on "

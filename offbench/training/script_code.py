@@ -1,7 +1,7 @@
-"""Hashes of an algorithm's class that was defined in a script, in a notebook or at a prompt.
+"""Hashes of an algorithm's class that was defined in a script, in a notebook or at a prompt (Python's `__main__`).
 
 What else a script does, such as how long it trains, may change between two runs of it. So the hashes are of the class,
-of what it uses of the script (functions, classes, numbers and texts), and of files beside the script that it uses.
+of what it uses of `__main__` (functions, classes, numbers and texts), and of files beside the script that it uses.
 """
 
 from __future__ import annotations
@@ -17,46 +17,42 @@ from pathlib import Path
 
 from offbench.common.files import sha256
 
-GLOBAL = "global "  # begins the names of what a class uses of its script
+MAIN = "__main__: "  # begins the names of what a class uses
 PLAIN = (bool, int, float, complex, str, bytes, type(None))
 
 
 def script_code(
     classes: list[type], source_hash: Callable[[str], str], file_hashes: Callable[[Path], dict[str, str]]
 ) -> dict[str, str]:
-    """Return {name: hash} of classes of `__main__`, of what they use there, and of imported files beside it.
+    """Return {name: hash} of classes of `__main__`, of what they use there, and of files beside it that they use.
 
     Args:
         source_hash: of source text.
         file_hashes: of a file and the files that it imports.
     """
     hashes = {cls.__qualname__: _hash(cls, source_hash) for cls in classes}
-    waiting, seen = [function for cls in classes for function in _functions(cls)], set[str]()
-    for cls in classes:
-        for name, value in vars(cls).items():
-            if not name.startswith("__") and _is_plain(value):  # it may come from a name in the script
-                hashes[f"{GLOBAL}{cls.__qualname__}.{name}"] = sha256(repr(value).encode())
+    used: dict[str, object] = {}  # what is found is looked through in turn
+    waiting: list[tuple[str, object]] = [item for cls in classes for item in _used_by_class(cls)]
     while waiting:
-        function = waiting.pop()
-        for name in _globals(function.__code__):
-            value = function.__globals__.get(name)
-            if name in seen or name not in function.__globals__ or any(value is cls for cls in classes):
-                continue
-            seen.add(name)
-            if isinstance(value, types.FunctionType | type) and value.__module__ == "__main__":
-                hashes[GLOBAL + name] = _hash(value, source_hash)
-                waiting += _functions(value) if isinstance(value, type) else [inspect.unwrap(value)]
-            elif _is_plain(value):
-                hashes[GLOBAL + name] = sha256(repr(value).encode())
-            elif file := _file_beside(value):
-                hashes |= file_hashes(file)
+        name, value = waiting.pop()
+        if name in used or any(value is cls for cls in classes):
+            continue
+        used[name] = value
+        if isinstance(value, types.FunctionType | type) and value.__module__ == "__main__":
+            if not any(name.startswith(f"{cls.__qualname__}.") for cls in classes):  # else it is in the class's source
+                hashes[MAIN + name] = _hash(value, source_hash)
+            waiting += _used_by_class(value) if isinstance(value, type) else _used_by_function(value)
+        elif _is_plain(value):
+            hashes[MAIN + name] = sha256(repr(value).encode())
+        elif file := _file_beside(value):
+            hashes |= {MAIN + path: found for path, found in file_hashes(file).items()}
     return hashes
 
 
-def _functions(cls: type) -> Iterator[types.FunctionType]:
-    """Yield the functions of a class, those of properties and of classes within it included."""
+def _used_by_class(cls: type) -> Iterator[tuple[str, object]]:
+    """Yield the functions, classes and values in a class with their names: a value may come from `__main__`."""
     for name, value in vars(cls).items():
-        if name.startswith("__") and name != "__post_init__" and dataclasses.is_dataclass(cls):  # written by it
+        if dataclasses.is_dataclass(cls) and name != "__post_init__":  # made by it, or a setting
             continue
         if isinstance(value, property):
             found: list[object] = [value.fget, value.fset]
@@ -65,20 +61,30 @@ def _functions(cls: type) -> Iterator[types.FunctionType]:
         else:
             found = [getattr(value, "__func__", value)]
         for one in found:
-            if isinstance(one, type) and one.__module__ == "__main__" and one.__qualname__ != cls.__qualname__:
-                yield from _functions(one)
-            elif callable(one) and isinstance(function := inspect.unwrap(one), types.FunctionType):
-                yield function
+            if isinstance(one, types.FunctionType):
+                yield one.__code__.co_qualname, one  # of a decorator, its own name
+            elif isinstance(one, type) or not name.startswith("__"):
+                yield f"{cls.__qualname__}.{name}", one
 
 
-def _globals(code: types.CodeType) -> Iterator[str]:
+def _used_by_function(function: types.FunctionType) -> Iterator[tuple[str, object]]:
+    """Yield the globals that a function reads, and the functions in its closure (which it decorates)."""
+    for name in _global_names(function.__code__):
+        if name in function.__globals__:
+            yield name, function.__globals__[name]
+    for cell in function.__closure__ or ():
+        if isinstance(content := cell.cell_contents, types.FunctionType):
+            yield content.__code__.co_qualname, content
+
+
+def _global_names(code: types.CodeType) -> Iterator[str]:
     """Yield the global names that a function reads, functions within it included."""
     for instruction in dis.get_instructions(code):
         if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
             yield instruction.argval
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
-            yield from _globals(constant)
+            yield from _global_names(constant)
 
 
 def _is_plain(value: object) -> bool:
@@ -90,12 +96,14 @@ def _is_plain(value: object) -> bool:
 
 def _hash(one: type | types.FunctionType, source_hash: Callable[[str], str]) -> str:
     """Return the hash of a class's or function's source; where Python does not know it, that of the compiled code."""
+    source = one if isinstance(one, type) else one.__code__  # of a decorated function, not of what it decorates
     try:
-        return source_hash(inspect.cleandoc("\n" + inspect.getsource(one)))
+        return source_hash(inspect.cleandoc("\n" + inspect.getsource(source)))
     except (OSError, TypeError, SyntaxError):
         pass
     if isinstance(one, type):
-        parts = [f"{function.__name__} {_hash(function, source_hash)}" for function in _functions(one)]
+        functions = [(name, value) for name, value in _used_by_class(one) if isinstance(value, types.FunctionType)]
+        parts = [f"{name} {_hash(function, source_hash)}" for name, function in functions]
         if dataclasses.is_dataclass(one):
             parts += [f"{field.name} {field.default!r}" for field in dataclasses.fields(one)]
         return sha256("\n".join(parts).encode())
@@ -103,6 +111,7 @@ def _hash(one: type | types.FunctionType, source_hash: Callable[[str], str]) -> 
 
 
 def _compiled(code: types.CodeType) -> tuple[object, ...]:
+    """Return what a code object does, without the lines and the file that it comes from."""
     constants: list[object] = []
     for one in code.co_consts:
         if isinstance(one, types.CodeType):

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 from offbench.common.files import sha256
 from offbench.training.registry import load_algorithm, own_algorithm
-from offbench.training.script_code import GLOBAL, script_code
+from offbench.training.script_code import MAIN, script_code
 
 if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
@@ -93,8 +93,8 @@ def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     if not set(before) & set(now):
         return f"{', '.join(before)}, not {', '.join(now)}"
     differ = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-    if not any(name.startswith(GLOBAL) for name in before):  # of an earlier version, which did not record them
-        differ = [name for name in differ if not name.startswith(GLOBAL)]
+    if not any(name.startswith(MAIN) for name in before):  # of an earlier version, which did not record them
+        differ = [name for name in differ if not name.startswith(MAIN)]
     return ", ".join(f"{name} {_describe_change(before.get(name), now.get(name))}" for name in differ)
 
 

@@ -12,7 +12,8 @@ import pytest
 import offbench
 from offbench.common.errors import OffbenchError
 from offbench.training import registry
-from offbench.training.source_code import code_of
+from offbench.training.script_code import MAIN
+from offbench.training.source_code import changes, code_of
 
 SCRIPT = """
 from offbench.algos.bc import BC
@@ -33,9 +34,15 @@ def weighted(value):
 def unused():
     return 1
 
+def shifted(function):
+    def call(self, run):
+        return function(self, run) + 7
+    return call
+
 class Mine(BC):
     limit = SCALE
 
+    @shifted
     def policy(self, run):
         self.steps = 1
         return halved(doubled(super().policy(run)))
@@ -68,8 +75,9 @@ def of_script(home: Path, script: str, half: str = "HALF = 0.5\n") -> dict[str, 
 @pytest.mark.parametrize(
     ("old", "new", "changed"),
     [
-        ("SCALE = 2.0", "SCALE = 4.0", {"global SCALE", "global Mine.limit"}),
-        ("3.0 * value", "5.0 * value", {"global weighted"}),
+        ("SCALE = 2.0", "SCALE = 4.0", {"__main__: SCALE", "__main__: Mine.limit"}),
+        ("3.0 * value", "5.0 * value", {"__main__: weighted"}),
+        ("+ 7", "+ 8", {"__main__: shifted.<locals>.call"}),
         ("self.steps = 1", "self.steps = 2", {"Mine"}),
         ("steps = 20", "steps = 40", set()),
         ("return 1", "return 2", set()),
@@ -78,13 +86,13 @@ def of_script(home: Path, script: str, half: str = "HALF = 0.5\n") -> dict[str, 
 )
 def test_an_edit_of_what_a_scripts_class_uses_is_noticed(home: Path, old: str, new: str, changed: set[str]) -> None:
     before, now = of_script(home, SCRIPT), of_script(home, SCRIPT.replace(old, new))
-    assert {"Mine", "bc.py", "global doubled", "helper.py", "parts.py"} <= before.keys()
+    assert {"Mine", "bc.py", "__main__: doubled", "__main__: helper.py", "__main__: parts.py"} <= before.keys()
     assert {name for name in {**before, **now} if before.get(name) != now.get(name)} == changed
 
 
 def test_an_edit_of_a_file_beside_a_script_is_noticed(home: Path) -> None:
     before, now = of_script(home, SCRIPT), of_script(home, SCRIPT, "HALF = 0.25\n")
-    assert {name for name in before if before[name] != now[name]} == {"parts.py"}
+    assert {name for name in before if before[name] != now[name]} == {"__main__: parts.py"}
 
 
 CELL = """
@@ -116,13 +124,23 @@ def test_an_edited_cell_of_a_notebook_is_noticed(home: Path, medium: str, monkey
 
     train(CELL)
     first = code_of("Mine")
-    assert {"Mine", "td3_bc.py", "global weighed", "global WEIGHT"} <= first.keys()
+    assert {"Mine", "td3_bc.py", "__main__: weighed", "__main__: WEIGHT"} <= first.keys()
     train(CELL.replace("WEIGHT = 1.0", "WEIGHT = 1.0  # a comment"), steps=30)
     for old, new, name in (
-        ("WEIGHT = 1.0", "WEIGHT = 2.0", "global WEIGHT"),
-        ("WEIGHT * loss", "WEIGHT * loss * 2", "global weighed"),
+        ("WEIGHT = 1.0", "WEIGHT = 2.0", "__main__: WEIGHT"),
+        ("WEIGHT * loss", "WEIGHT * loss * 2", "__main__: weighed"),
         ("weighed(1.0)", "weighed(2.0)", "Mine"),
     ):
         with pytest.raises(OffbenchError, match=f"trained by other code of Mine: {name} has changed"):
             train(CELL.replace(old, new), steps=30)
     train(CELL, steps=40)
+
+
+def test_a_scripts_class_of_an_earlier_version_has_not_changed(home: Path) -> None:
+    """Earlier versions hashed the class, its Config and its bases only."""
+    now = of_script(home, SCRIPT)
+    before = {name: text for name, text in now.items() if not name.startswith(MAIN)}
+    assert {"Mine", "Config", "bc.py"} == before.keys()
+    assert not changes(before, now)
+    assert changes(before | {"Mine": "0" * 64}, now) == "Mine has changed"
+    assert changes(now, of_script(home, SCRIPT, "HALF = 0.25\n")) == "__main__: parts.py has changed"
