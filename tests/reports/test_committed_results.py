@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 import offbench
-from tests import beside_d3rlpy
+from tests import beside_d3rlpy, observations
+from tests.made_runs import made_run
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
@@ -26,3 +27,20 @@ def test_the_committed_tables_are_those_of_the_committed_runs(runs: Path) -> Non
 
 def test_the_committed_comparison_with_d3rlpy_is_that_of_the_committed_runs() -> None:
     assert beside_d3rlpy.FILE.read_text() == beside_d3rlpy.table()
+
+
+def test_observations_by_hand(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evaluations of 40 and 60, three episodes of 500 steps each; the own reference of made runs is 0 to 100."""
+    for seed in range(2):
+        made_run(
+            Path("runs"), "x-medium-v0", "td3_bc", "default", seed, 0, returns={10_000: 40.0, 20_000: 60.0 + seed}
+        )
+    monkeypatch.setattr("sys.argv", ["observations", "runs"])
+    observations.main()
+    name, header, _, *lines = capsys.readouterr().out.splitlines()
+    assert (name, header.split()) == ("x-medium-v0", ["step", "td3_bc"])
+    assert [line.split() for line in lines[:2]] == [["10,000", "40.0"], ["20,000", "60.5"]]
+    assert lines[3] == (
+        "td3_bc: 100% of the last episodes take 500 steps, half of them at most 500; "
+        "successive evaluations differ by 20.5"
+    )
