@@ -8,16 +8,14 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from offbench.analysis.evaluated_run import EvaluatedRun, keys_with_mixed_code, window_text
 from offbench.analysis.methods import find_method, unnamed_settings
 from offbench.analysis.results import (
     REFERENCES,
     Entry,
-    EvaluatedRun,
     Task,
     differing_settings_notes,
-    keys_with_mixed_code,
     read_results,
-    window_text,
 )
 from offbench.analysis.statistics import Estimate, Paired, improvement, paired
 from offbench.common.errors import OffbenchError
@@ -154,18 +152,19 @@ class Comparison:
         }
 
 
-def compare(a: str, b: str, *, runs: str | Path = "runs") -> Comparison:
+def compare(a: str, b: str, *, runs: str | Path = "runs", steps: int | None = None) -> Comparison:
     """Compare two groups of runs over the datasets and seeds that both have.
 
     Args:
         a, b: the names of two methods as in tables, e.g. `td3_bc` and `bdb (beta=0.5)`; or ALGO/VARIANT, as
             in folders. An algorithm alone is its default variant, or its only one.
         runs: the folder of the run directories.
+        steps: compare the runs as they were after so many updates; shorter ones as they are.
 
     Raises:
         OffbenchError: no such group, the two are one, or they share no dataset and seed.
     """
-    results = read_results(runs)
+    results = read_results(runs, steps=steps)
     groups = tuple(results.of(find_method(results.methods, name)) for name in (a, b))
     if groups[0] == groups[1]:
         raise OffbenchError(f"{a} and {b} are the same runs; give two groups")

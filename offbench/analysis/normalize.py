@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import shlex
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
@@ -27,7 +28,7 @@ Row: TypeAlias = JsonObject
 FORMATS = ("table", "json", "csv", "markdown", "latex")
 
 
-def score_runs(runs: str | Path = "runs") -> list[Row]:
+def score_runs(runs: str | Path = "runs", steps: int | None = None) -> list[Row]:
     """Return one row for each (dataset, algorithm, variant) below a folder, seeds averaged.
 
     A run's score is the mean of its last 10 evaluations; a row has the mean and the standard deviation over
@@ -37,10 +38,14 @@ def score_runs(runs: str | Path = "runs") -> list[Row]:
     steps of the evaluations behind the scores, and is empty if they differ between seeds: only scores of one window
     compare. `differing_settings` (in JSON and CSV) says in which settings the runs of a row differ.
 
+    Args:
+        runs: the folder of the run directories.
+        steps: score the runs as they were after so many updates; shorter ones as they are.
+
     Raises:
         OffbenchError: the folder holds no evaluated run. Damaged ones are named on stderr and left out.
     """
-    return _rows(read_results(runs).entries.values())
+    return _rows(read_results(runs, steps=steps).entries.values())
 
 
 def score_some(runs: Iterable[Run]) -> list[Row]:
@@ -48,15 +53,18 @@ def score_some(runs: Iterable[Run]) -> list[Row]:
     return _rows(entries_of(runs)[0])
 
 
-def without_evaluation(runs: str | Path) -> tuple[int, int]:
+def without_evaluation(runs: str | Path, steps: int | None = None) -> tuple[int, int]:
     """Return how many runs below a folder have no evaluation yet, and how many diverged before their first one.
 
-    Damaged ones are not counted.
+    Damaged ones are not counted. With `steps`, only evaluations within so many updates count.
     """
     diverged = []
+    last = math.inf if steps is None else steps
     for run in find_runs(Path(runs)):
         with contextlib.suppress(OffbenchError, OSError):
-            diverged += [run.diverged] if not run.evaluations() else []
+            evaluations = run.evaluations()
+            if not any(step <= last for step in evaluations):
+                diverged.append(run.diverged and not evaluations)
     return diverged.count(False), diverged.count(True)
 
 
@@ -124,8 +132,12 @@ def score_returns(env: str, returns: Sequence[float]) -> list[Row]:
     ]
 
 
-def normalize(runs: str | Path = "runs", *, env: str | None = None, returns: Sequence[float] = ()) -> list[Row]:
+def normalize(
+    runs: str | Path = "runs", *, steps: int | None = None, env: str | None = None, returns: Sequence[float] = ()
+) -> list[Row]:
     """Score all runs below a folder; or, with `env`, score `returns` of that environment.
+
+    With `steps`, the runs are scored as they were after so many updates (shorter ones as they are).
 
     Rows are dictionaries; `offbench.analysis.normalize.render(rows, "markdown")` prints them.
     """
@@ -133,7 +145,9 @@ def normalize(runs: str | Path = "runs", *, env: str | None = None, returns: Seq
     if env is None:
         if returns:
             raise OffbenchError("returns need their environment: give --env, e.g. --env hopper 1234.5")
-        return score_runs(runs)
+        return score_runs(runs, steps)
+    if steps is not None:
+        raise OffbenchError("--steps has no effect with --env; leave it out")
     if not returns:
         raise OffbenchError(f"give the returns to normalize, e.g. --env {env} 1234.5 987")
     return score_returns(env, returns)

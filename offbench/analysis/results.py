@@ -14,17 +14,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase as fnmatch
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
+from offbench.analysis.evaluated_run import EvaluatedRun, keys_with_mixed_code
 from offbench.analysis.methods import Method, find_method, method_order, name_methods, rank
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import READ_REMEDIES
-from offbench.common.scores import SCORED_EVALUATIONS, Evaluations, mean_std, normalize, run_return, window
+from offbench.common.scores import SCORED_EVALUATIONS, mean_std
 from offbench.common.terminal import warn
-from offbench.common.text import from_to, plural
 from offbench.data.levels import LEVELS, env_and_level
 from offbench.envs.environments import same_environment
 from offbench.training.run import DIGITS, Run, find_runs
@@ -35,7 +34,6 @@ ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
 REFERENCES = {"dataset": "own reference", "d4rl": "D4RL's constants", None: "no reference: raw return"}
 
 LONG_CURVE = 40  # evaluations, of which more are drawn as means
-Key = TypeVar("Key")
 
 
 @dataclass(frozen=True)
@@ -62,56 +60,6 @@ class Task:
     def env_and_level(self) -> tuple[str, str]:
         """(environment, level), read from the dataset id; the level is "" if the id has none."""
         return env_and_level(self.dataset)
-
-
-@dataclass(frozen=True)
-class EvaluatedRun:
-    """One run with its evaluations and the rows of its losses.csv."""
-
-    run: Run
-    config: RunConfig
-    evaluations: Evaluations
-    losses: Sequence[Mapping[str, float]] = ()
-
-    @property
-    def seed(self) -> int:
-        """The run's seed."""
-        return self.config.seed
-
-    @property
-    def window(self) -> tuple[int, ...]:
-        """The steps of the evaluations behind the run's score."""
-        return window(self.evaluations)
-
-    @property
-    def reached(self) -> int:
-        """The newest evaluated step."""
-        return max(self.evaluations)
-
-    @property
-    def steps(self) -> int:
-        """The run's last step."""
-        return self.config.steps
-
-    @property
-    def state(self) -> str:
-        """`finished`, `unfinished` or `diverged`."""
-        if self.run.diverged:
-            return "diverged"
-        return "finished" if self.reached >= self.steps else "unfinished"
-
-    def score(self, reference: str | None) -> float:
-        """Return the run's score by a reference that it has (None: its return)."""
-        return self._normalized(run_return(self.evaluations), reference)
-
-    def curve(self, reference: str | None) -> dict[int, float]:
-        """Return the score of each evaluation."""
-        means = {step: float(np.mean([ret for ret, _ in rows])) for step, rows in self.evaluations.items()}
-        return {step: self._normalized(mean, reference) for step, mean in means.items()}
-
-    def _normalized(self, value: float, reference: str | None) -> float:
-        references = self.config.references.get(reference) if reference else None
-        return normalize(value, *references) if references else value
 
 
 @dataclass(frozen=True)
@@ -226,10 +174,13 @@ class Results:
 Folders = str | Path | Sequence[str | Path]
 
 
-def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequence[str] = ()) -> Results:
+def read_results(
+    runs: Folders, *, steps: int | None = None, datasets: Sequence[str] = (), methods: Sequence[str] = ()
+) -> Results:
     """Read every run below one or more folders.
 
     Args:
+        steps: read the runs as they were after so many updates; shorter ones as they are.
         datasets: only these, by id or by a pattern such as `hopper-*`; all if empty.
         methods: only these, by their names in tables; all if empty.
 
@@ -239,10 +190,12 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
     """
     roots = tuple(map(Path, [runs] if isinstance(runs, str | Path) else runs))
     unique = {run.folder.resolve(): run for root in roots for run in find_runs(root)}
-    entries, unevaluated = entries_of(unique.values(), datasets)
+    entries, unevaluated = entries_of(unique.values(), datasets, steps=steps)
     if not entries:
         below = ", ".join(map(str, roots))
         missing = "" if any(root.exists() for root in roots) else " (no such folder)"
+        if unevaluated and steps is not None:
+            raise OffbenchError(f"no run below {below} has an evaluation within {steps:,} updates; give more --steps")
         raise OffbenchError(
             f"no evaluated runs below {below}{missing}; start one with `offbench train ALGO --dataset ID`"
         )
@@ -253,15 +206,6 @@ def read_results(runs: Folders, *, datasets: Sequence[str] = (), methods: Sequen
     tasks = dict.fromkeys(entry.task for entry in entries)
     ordered = sorted({entry.method for entry in entries}, key=method_order)
     return Results(roots, tuple(tasks), tuple(ordered), {(e.task, e.method): e for e in entries}, tuple(unevaluated))
-
-
-def keys_with_mixed_code(runs: Iterable[tuple[Key, EvaluatedRun]]) -> list[Key]:
-    """Return the keys whose runs were trained by different code of the algorithm, as far as their config.json says."""
-    codes: dict[Key, set[tuple[tuple[str, str], ...]]] = {}
-    for key, trained in runs:
-        if trained.config.code:
-            codes.setdefault(key, set()).add(tuple(trained.config.code.items()))
-    return [key for key, found in codes.items() if len(found) > 1]
 
 
 def mixed_code(entries: Iterable[Entry]) -> list[tuple[Task, str]]:
@@ -275,15 +219,8 @@ def differing_settings_notes(entries: Iterable[Entry]) -> list[str]:
     return [f"the runs of {e.method.label} on {e.task.name} differ in {text}" for e, text in found if text]
 
 
-def window_text(runs: Iterable[EvaluatedRun]) -> str:
-    """Return which evaluations are behind the scores of runs: `10 evaluations, steps 5,000 to 50,000`."""
-    windows = [trained.window for trained in runs]
-    counts, ends = {len(steps) for steps in windows}, {end for steps in windows for end in (steps[0], steps[-1])}
-    return f"{from_to(counts)} {plural(max(counts), 'evaluation')}, {plural(len(ends), 'step')} {from_to(ends)}"
-
-
 def entries_of(
-    runs: Iterable[Run], datasets: Sequence[str] = (), *, compared: bool = True
+    runs: Iterable[Run], datasets: Sequence[str] = (), *, steps: int | None = None, compared: bool = True
 ) -> tuple[list[Entry], list[Run]]:
     """Return runs as entries in the order of the paper's table, and the runs that have no evaluation yet.
 
@@ -291,6 +228,7 @@ def entries_of(
 
     Args:
         datasets: only these, by id or by a pattern; all if empty.
+        steps: as in read_results.
         compared: whether the runs are compared, so that those on the same data must have been evaluated alike.
 
     Raises:
@@ -303,6 +241,7 @@ def entries_of(
     for run in runs:
         try:
             trained = EvaluatedRun(run, run.config(), run.evaluations(), run.losses())
+            trained = trained.up_to(steps) if steps is not None else trained
         except OffbenchError as error:
             damaged.append(error)
             continue

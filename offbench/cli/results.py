@@ -26,6 +26,7 @@ from offbench.common.text import counted
 EPISODE_OPTIONS = {"env", "episodes", "stochastic", "workers"}  # options of `evaluate` without --similarity
 SIMILARITY_OPTIONS = {"algorithm", "tolerance", "action_tolerance"}  # and with it
 RUNS_HELP = "folder of the runs (default: runs)"
+STEPS_HELP = "score the runs as they were after N updates (default: at their last evaluations)"
 
 
 def normalize_arguments(parser: Parser, _: list[str]) -> None:
@@ -37,6 +38,7 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
         parser.add_argument("--env", metavar="ENV", help="shipped environment or recipe file of the returns"), recipes
     )
     parser.add_argument("--runs", default="runs", metavar="DIR", help=RUNS_HELP)
+    parser.add_argument("--steps", type=positive_int, metavar="N", help=STEPS_HELP)
     parser.add_argument(
         "--format",
         choices=FORMATS,
@@ -51,15 +53,16 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
         from offbench.analysis.normalize import without_evaluation
 
         print_scores(offbench.normalize(**arguments), style)
-        waiting, diverged = (0, 0) if arguments["env"] else without_evaluation(arguments["runs"])
+        waiting, diverged = (0, 0) if arguments["env"] else without_evaluation(arguments["runs"], arguments["steps"])
         if waiting:
-            note(f"{counted(waiting, 'run')} without an evaluation yet")
+            when = f"within {arguments['steps']:,} updates" if arguments["steps"] else "yet"
+            note(f"{counted(waiting, 'run')} without an evaluation {when}")
         if diverged:
             note(f"{counted(diverged, 'run')} diverged before the first evaluation")
         if plot:
             from offbench.reports.figures import plot_curves
 
-            print(f"saved {plot_curves(arguments['runs'], plot)}", file=sys.stderr)
+            print(f"saved {plot_curves(arguments['runs'], plot, arguments['steps'])}", file=sys.stderr)
 
     parser.set_defaults(run=run)
 
@@ -82,6 +85,7 @@ def report_arguments(parser: Parser, _: list[str]) -> None:
         "--runs", nargs="+", default=["runs"], metavar="DIR", help="folders of runs, shown together (default: runs)"
     )
     parser.add_argument("--out", default="report", metavar="DIR", help="folder of the report (default: report)")
+    parser.add_argument("--steps", type=positive_int, metavar="N", help=STEPS_HELP)
     parser.add_argument("--title", help="title of the page (default: Offline RL benchmark)")
     datasets = parser.add_argument(
         "--datasets", nargs="+", metavar="ID", help="only these datasets: ids, or patterns such as 'hopper-*'"
@@ -103,6 +107,7 @@ def compare_arguments(parser: Parser, _: list[str]) -> None:
         methods,
     )
     parser.add_argument("--runs", default="runs", metavar="DIR", help=RUNS_HELP)
+    parser.add_argument("--steps", type=positive_int, metavar="N", help=STEPS_HELP)
     parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(json: bool, **arguments: Any) -> None:

@@ -107,8 +107,11 @@ def _paint_curves(axes: Axes, entries: Sequence[Entry], styles: Mapping[Method, 
     axes.set(xlabel="updates", ylabel=_unit(entries[0].task), title=shortened(entries[0].task.name, 44))
 
 
-def plot_curves(runs: str | Path, path: str | Path) -> Path:
+def plot_curves(runs: str | Path, path: str | Path, steps: int | None = None) -> Path:
     """Draw the learning curves of all runs below a folder as one figure, a panel for each dataset.
+
+    Args:
+        steps: only so many updates of each run.
 
     Raises:
         OffbenchError: there are no evaluated runs, or the figure cannot be written.
@@ -116,7 +119,7 @@ def plot_curves(runs: str | Path, path: str | Path) -> Path:
     import matplotlib as mpl
 
     path = picture_file(path)
-    results = read_results(runs)
+    results = read_results(runs, steps=steps)
     styles = line_styles(results.methods)
     with mpl.rc_context(_rc_params(path.stem)):
         fig, panels = figure(len(results.tasks))

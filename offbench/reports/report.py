@@ -41,6 +41,7 @@ def report(
     out: str | Path = "report",
     *,
     title: str | None = None,
+    steps: int | None = None,
     datasets: Sequence[str] | None = None,
     methods: Sequence[str] | None = None,
 ) -> Path:
@@ -50,6 +51,7 @@ def report(
         runs: the folder of the run directories, or several; one run is enough, unfinished ones are marked.
         out: the report's folder; an older report in it is replaced.
         title: of the page.
+        steps: show the runs as they were after so many updates; shorter ones as they are.
         datasets: only these, by id or by a pattern such as `hopper-*`.
         methods: only these, by their names in tables.
 
@@ -62,7 +64,7 @@ def report(
     folder = Path(out)
     if folder.suffix.lower() in (".html", ".htm", ".pdf"):
         raise OffbenchError(f"a report is a folder with an {PAGE} in it: give --out {folder.with_suffix('')}")
-    results = read_results(runs, datasets=datasets or (), methods=methods or ())
+    results = read_results(runs, steps=steps, datasets=datasets or (), methods=methods or ())
     before = _earlier_files(folder)
     aggregates = tables.iqms(results)
     by_name, pictures = _tables(results, aggregates), _figures(results, aggregates)

@@ -66,7 +66,7 @@ def similarity_tables(results: Results) -> list[Table]:
 
 
 def _similar(entry: Entry) -> list[Similarity]:
-    """Return the similar scores of the runs of a cell that have one; damaged ones are named on stderr."""
+    """Return the similar scores of the runs of a cell, as far as shown; damaged ones are named on stderr."""
     scores = []
     for trained in entry.runs:
         try:
@@ -74,7 +74,7 @@ def _similar(entry: Entry) -> list[Similarity]:
         except OffbenchError as error:
             warn(f"left out of the similar scores: {error}")
             continue
-        if score is not None:
+        if score is not None and score.step <= trained.steps:
             scores.append(score)
     return scores
 

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TypeAlias
 
 from offbench.analysis.compare import comparable, differences, favored, pair_runs
+from offbench.analysis.evaluated_run import window_text
 from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import (
     REFERENCES,
@@ -17,7 +18,6 @@ from offbench.analysis.results import (
     Task,
     differing_settings_notes,
     mixed_code,
-    window_text,
 )
 from offbench.analysis.statistics import Estimate, Scores, improvement, iqm, paired
 from offbench.common.scores import SCORED_EVALUATIONS, mean_std, plus_minus

@@ -16,7 +16,7 @@ from offbench.envs.recipes import load_recipe, names
 from offbench.training.registry import algorithm_names
 
 if TYPE_CHECKING:
-    from offbench.analysis.results import EvaluatedRun
+    from offbench.analysis.evaluated_run import EvaluatedRun
     from offbench.training.run import Run
     from offbench.training.run_config import RunConfig
 

@@ -113,6 +113,22 @@ def test_a_similar_score_of_an_earlier_step_or_of_some_runs_says_so(home: Path) 
     assert row["td3_bc"] == "not averaged (at steps 10,000 and 30,000)"
 
 
+def test_a_report_of_an_earlier_step_shows_nothing_later(home: Path) -> None:
+    longer, shorter = {10_000: 10.0, 20_000: 20.0, 30_000: 90.0}, {10_000: 15.0, 20_000: 16.0}
+    run = made_run(home / "runs", "x-medium-v0", "td3_bc", "default", 0, 0, returns=longer)
+    made_run(home / "runs", "x-medium-v0", "bc", "default", 0, 0, steps=20_000, returns=shorter)
+    run.mark_diverged(30_500, "critic")
+    found = {"step": 30_000, "samples": 2560, "q_similar": 92.5, "action_similar": 50.0}
+    write_json(run.folder / "similarity.json", found | {"tolerance": 0.05, "action_tolerance": 0.1})
+    assert "92.5" in offbench.report(out="whole").read_text()
+    main(["report", "--out", "out", "--steps", "20000"])
+    page = Page(home / "out" / "index.html")
+    assert "All runs are finished." in page.text
+    assert "92.5" not in page.text
+    ((row),) = rows(home / "out" / "tables" / "scores.csv")
+    assert [row[f"{name} (20,000 steps)"] for name in ("td3_bc", "bc")] == ["15.0 ± ?", "15.5 ± ?"]
+
+
 def test_the_papers_names_are_for_the_papers_grid(home: Path) -> None:
     made_grid(home / "runs", seeds=2, levels=1)
     page = Page(offbench.report("runs", "out"))
