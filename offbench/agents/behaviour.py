@@ -16,7 +16,7 @@ from offbench.envs.recipes import Recipe, load_recipe
 
 
 def behaviour(
-    env: str | Recipe,
+    env: str | Path | Recipe,
     *,
     seed: int = 0,
     steps: int | None = None,
@@ -41,7 +41,7 @@ def behaviour(
     Raises:
         OffbenchError: a bad argument, a folder of another training, or no policy better than random actions.
     """
-    recipe, seed = load_recipe(env) if isinstance(env, str) else env, check_seed(seed)
+    recipe, seed = env if isinstance(env, Recipe) else load_recipe(env), check_seed(seed)
     steps = recipe.sac.steps if steps is None else steps
     segment = recipe.sac.segment
     if steps < segment or steps % segment:
@@ -49,7 +49,7 @@ def behaviour(
     folder = TrainingFolder(recipe, seed, folder_of(recipe, seed, Path(behaviour_dir)))
     ladder = check_output_folder(Path(out) if out else folder.path / "ladder")
     train(folder, steps)
-    name = shlex.quote(env) if isinstance(env, str) else recipe.name
+    name = recipe.name if isinstance(env, Recipe) else shlex.quote(str(env))
     command = f"offbench behaviour {name} --seed {seed} --steps {steps}"
     with folder.locked():
         return build_ladder(folder, steps, ladder, default_workers(workers), command)

@@ -212,13 +212,22 @@ def restore_replaced(folder: Path) -> None:
 
 
 def _warn_other_recipe(ladder: Ladder, recipe: Recipe) -> None:
-    """Warn about settings of the recipe that have changed since the agent was trained."""
+    """Warn about settings of the recipe that have changed since the agent was trained or measured."""
     used, wanted = ladder.info.sac, json.loads(json.dumps(dataclasses.asdict(recipe.sac)))
     changed = [key for key, value in wanted.items() if used.get(key, value) != value]
     if changed:
         warn(
             f"that agent was trained with other [sac] settings than the recipe's "
             f"({', '.join(changed)}); delete {ladder.folder.parent} to train it again"
+        )
+    measured = {
+        "reference_episodes": (ladder.info.references["expert"]["episodes"], recipe.measure.reference_episodes),
+        "replay_envs": (ladder.info.medium_replay.envs, recipe.replay_envs),
+    }
+    if changed := [key for key, (before, now) in measured.items() if before != now]:
+        warn(
+            f"the policies and references of that agent were measured with other settings than the recipe's "
+            f"({', '.join(changed)}); `offbench behaviour` measures them again"
         )
 
 

@@ -28,7 +28,7 @@ FLATTEN = "<class 'stable_baselines3.common.torch_layers.FlattenExtractor'>"  # 
 
 
 def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
-    """Return the policy of an SB3 agent; nothing of the zip is unpickled.
+    """Return the policy of an SB3 agent; only its tensors are read.
 
     Args:
         low, high: [act], the bounds of the environment's actions, used if the zip does not hold them.

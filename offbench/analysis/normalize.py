@@ -105,7 +105,7 @@ def _row(entry: Entry, ambiguous: bool) -> Row:
     return row
 
 
-def score_returns(env: str, returns: Sequence[float]) -> list[Row]:
+def score_returns(env: str | Path, returns: Sequence[float]) -> list[Row]:
     """Return one row for each return: its score by our reference (if there is a ladder) and by D4RL's constants.
 
     Raises:
@@ -119,7 +119,7 @@ def score_returns(env: str, returns: Sequence[float]) -> list[Row]:
     d4rl = recipe.d4rl_reference()
     if not ours and not d4rl:
         raise OffbenchError(
-            f"{env} has no reference scores yet; measure them with `offbench behaviour {shlex.quote(env)}`"
+            f"{env} has no reference scores yet; measure them with `offbench behaviour {shlex.quote(str(env))}`"
         )
     return [
         {
@@ -133,7 +133,11 @@ def score_returns(env: str, returns: Sequence[float]) -> list[Row]:
 
 
 def normalize(
-    runs: str | Path = "runs", *, steps: int | None = None, env: str | None = None, returns: Sequence[float] = ()
+    runs: str | Path = "runs",
+    *,
+    steps: int | None = None,
+    env: str | Path | None = None,
+    returns: Sequence[float] = (),
 ) -> list[Row]:
     """Score all runs below a folder; or, with `env`, score `returns` of that environment.
 

@@ -56,7 +56,7 @@ class Benchmark:
 def prepare(
     grid: str,
     *,
-    env: str | None = None,
+    env: str | Path | None = None,
     runs: str | Path = "runs",
     device: str = "auto",
     workers: int | None = None,

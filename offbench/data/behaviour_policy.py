@@ -12,6 +12,7 @@ from offbench.agents.sb3_zip import read_sb3_zip
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import sha256
+from offbench.common.terminal import warn
 from offbench.data.levels import FRACTION, LEVELS
 from offbench.rollouts.function_policy import FunctionPolicy, function_policy
 from offbench.rollouts.policy import Policy, load_policy
@@ -62,8 +63,15 @@ def read_behaviour_policy(source: str, low: Array, high: Array, observation_dim:
         )
     if not (np.allclose(policy.low, low) and np.allclose(policy.high, high)):
         raise OffbenchError(f"{source} acts in {policy.low} to {policy.high}, but {env_id} in {low} to {high}")
+    if _task(policy.env_id) != _task(env_id):
+        warn(f"{source} was trained for {policy.env_id}, and is recorded in {env_id}")
     algorithm = str(policy.origin.get("algorithm", "unknown"))
     return BehaviourPolicy(policy, path.name or source, algorithm, sha256(policy.to_bytes()))
+
+
+def _task(env_id: str) -> str:
+    """Return an environment's id without its version."""
+    return re.sub(r"-v\d+$", "", env_id)
 
 
 def level_name(name: str | None, source: str) -> str:

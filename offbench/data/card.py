@@ -33,7 +33,7 @@ BINS = 50
 BLUE, RED = "#3b6ea5", "#c4443c"
 
 
-def card(env: str, out: str | Path | None = None, behaviour_dir: str | Path = BEHAVIOUR) -> Path:
+def card(env: str | Path, out: str | Path | None = None, behaviour_dir: str | Path = BEHAVIOUR) -> Path:
     """Write the card of an environment from its five recorded levels (seed 0, the recipe's size).
 
     Args:
@@ -47,6 +47,7 @@ def card(env: str, out: str | Path | None = None, behaviour_dir: str | Path = BE
     Raises:
         OffbenchError: a level is missing or was recorded with other settings, or there is no ladder.
     """
+    env = str(env)
     recipe = load_recipe(env)
     ladder = find_ladder(recipe, Path(behaviour_dir))
     if ladder is None:

@@ -25,10 +25,11 @@ from offbench.data.card import compare_with_card
 from offbench.data.levels import Part, full_size, parse_level, parse_mix, shares
 from offbench.data.minari_reader import open_minari
 from offbench.data.other_references import warn_other_references
-from offbench.envs.contact_margins import model_of
+from offbench.envs.contact_margins import has_margins, model_of
 from offbench.envs.environments import make_env, spaces_of
-from offbench.envs.margin_rule import MARGIN, without_margin
+from offbench.envs.margin_rule import EARLIER, LAST_EARLIER, MARGIN, MUJOCO_VERSIONS, without_margin
 from offbench.envs.recipes import Recipe, load_recipe
+from offbench.envs.version_warning import same_physics
 from offbench.rollouts.function_policy import FunctionPolicy
 from offbench.rollouts.policy import Policy, uniform
 from offbench.rollouts.rollouts import Episode, Rollouts
@@ -41,8 +42,8 @@ REPOSITORY = "https://github.com/offbench/offbench"
 
 
 def collect(
-    env: str,
-    level: str = "medium",
+    env: str | Path,
+    level: str | float = "medium",
     *,
     mix: str | None = None,
     steps: int | None = None,
@@ -60,7 +61,7 @@ def collect(
 
     Args:
         env: a shipped recipe's name (`hopper`) or a recipe file (`./my-env.toml`).
-        level: random, medium, medium-replay, medium-expert, expert, or a fraction such as "0.6".
+        level: random, medium, medium-replay, medium-expert, expert, or a fraction such as 0.6.
         mix: a blend instead of a level, e.g. "random:0.5,expert:0.5".
         steps: transitions; default: the recipe's (1,000,000 per part; medium-replay: all of the training's).
         seed: of the recorded episodes. The same seed gives the same content for any number of workers.
@@ -70,8 +71,8 @@ def collect(
             another one is an error.
         retrain: use a behaviour agent trained here instead of the shipped one.
         accept: record the nearest policy even if none is near a fraction, or medium is far from a third of the expert.
-        policy: record with this policy instead of a level: an agent's zip of Stable-Baselines3 (nothing of it is
-            unpickled), a run's folder, a policy file, or `module:function` of the user's own. It acts as it was
+        policy: record with this policy instead of a level: an agent's zip of Stable-Baselines3 (only its tensors are
+            read), a run's folder, a policy file, or `module:function` of the user's own. It acts as it was
             trained to explore: a stochastic one samples.
         name: of the level that such a dataset gets; default: the policy's own name.
         behaviour_dir: where agents trained here live.
@@ -82,7 +83,7 @@ def collect(
     Raises:
         OffbenchError: anything that the user can fix, in one line.
     """
-    recipe, seed = load_recipe(env), check_seed(seed)
+    recipe, level, seed = load_recipe(env), str(level), check_seed(seed)
     policy_source = None
     if policy is None:
         if name is not None:
@@ -153,13 +154,15 @@ def _is_same(dataset_id: str, wanted: JsonObject) -> bool:
     return same
 
 
-def _train(env: str, behaviour_dir: Path, workers: int) -> Ladder:
+def _train(env: str | Path, behaviour_dir: Path, workers: int) -> Ladder:
     """Train the recipe's behaviour agent now."""
     from offbench.agents.behaviour import behaviour
 
     recipe = load_recipe(env)
     recipe.env_spec()  # refuses a bad environment before the training is announced
-    inform(f"{recipe.name} has no behaviour agent in {behaviour_dir} yet; training one first")
+    others = sorted(path.parents[1].name for path in (behaviour_dir / recipe.name).glob("seed-*/ladder/ladder.json"))
+    found = f" of seed 0 (there is {', '.join(others)}, whose policies --policy records)" if others else ""
+    inform(f"{recipe.name} has no behaviour agent{found} in {behaviour_dir} yet; training one first")
     return behaviour(env, behaviour_dir=behaviour_dir, workers=workers)
 
 
@@ -173,7 +176,8 @@ class _Recording:
         self.workers = workers if workers > 1 else 0  # a single one would be no faster than this process
         self.spec = recipe.env_spec()
         env = make_env(self.spec)
-        self.mujoco = model_of(env) is not None
+        model = model_of(env)
+        self.mujoco, self.margins = model is not None, model is not None and has_margins(model)
         self.spaces = self.observation_space, action_space = spaces_of(env, recipe.env_id)
         self.bounds = action_space.low, action_space.high
         self.own_policy: BehaviourPolicy | None = None
@@ -351,6 +355,11 @@ def _metadata(
     recipe, references, made = recording.recipe, recording.references, versions()
     described = [recording.describe(*item) for item in zip(parts, sources, counts, strict=True)]
     full, total = recording.full_size(parts), sum(counts)
+    mujoco, margins = f"mujoco=={made['mujoco']}", ""
+    if recording.margins:
+        margins = f" Contact margins as in MuJoCo {MUJOCO_VERSIONS[recipe.contact_margin]}: see offbench.make_env."
+        if recipe.contact_margin == EARLIER and same_physics(LAST_EARLIER, made["mujoco"], recording.spec):
+            mujoco = f"mujoco<={LAST_EARLIER}"
     short = f" A short recording: {total:,} of {full:,} transitions." if total < full else ""
     origin_texts = [recording.origin_text(part, rung) for part, rung in zip(parts, sources, strict=True)]
     if recording.own_policy:
@@ -365,8 +374,9 @@ def _metadata(
         "author": {"offbench"},
         "author_email": {"offbench@example.org"},
         "code_permalink": f"{REPOSITORY}/tree/v{made['offbench']}",
-        "description": f"{recipe.env_id}, level {level}: {', then '.join(origin_texts)}. Recorded by offbench.{short}",
-        "requirements": [f"mujoco=={made['mujoco']}", f"gymnasium=={made['gymnasium']}"],
+        "description": f"{recipe.env_id}, level {level}: {', then '.join(origin_texts)}. Recorded by offbench."
+        f"{margins}{short}",
+        "requirements": [mujoco, f"gymnasium=={made['gymnasium']}"],
         "ref_min_score": references["random"]["return"],
         **({"ref_max_score": references["expert"]["return"]} if "expert" in references else {}),
         "num_episodes_average_score": int(references["random"]["episodes"]),

@@ -57,7 +57,7 @@ ORIGINAL = {"Hopper-v2": (11, 3), "HalfCheetah-v2": (17, 6), "Walker2d-v2": (17,
 LEVEL_WORDS = ("random", "medium", "expert", "mixed", "full")
 
 
-def import_d4rl(file: str | Path, dataset_id: str, *, env: str | None = None, overwrite: bool = False) -> str:
+def import_d4rl(file: str | Path, dataset_id: str, *, env: str | Path | None = None, overwrite: bool = False) -> str:
     """Turn a D4RL file (v0, v1, v2, or one that `offbench export` wrote) into a local Minari dataset.
 
     Args:
@@ -120,7 +120,7 @@ class _Origin:
         return time_limit(parse_spec(self.recorded)) if self.recorded else None
 
 
-def _origin(source: Source, env: str | None) -> _Origin:
+def _origin(source: Source, env: str | Path | None) -> _Origin:
     """Return a file's environment: what an export's metadata say, then what the user says, then by the file's name.
 
     Raises:

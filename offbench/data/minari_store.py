@@ -265,6 +265,7 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     path = path_of(dataset_id)
     if not path.parent.resolve().is_relative_to(root().resolve()):
         raise OffbenchError(f"{dataset_id} leads out of {root()} by a link; choose another id")
+    _check_nesting(dataset_id, path)
     with exclusive_lock(hidden_path(path, "lock"), f"{dataset_id} is being recorded"):
         with disk_errors(str(path)):
             recover(path)
@@ -272,6 +273,15 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
             message = f"{dataset_id} exists already{_size(dataset_id)}"
             raise OffbenchError(f"{message}; use --overwrite to replace it, or --id for another id")
         yield path
+
+
+def _check_nesting(dataset_id: str, path: Path) -> None:
+    """Raise OffbenchError if an id is inside the folder of another dataset, or other datasets are inside its own."""
+    metadata = Path("data", "metadata.json")
+    above = [folder for folder in path.parents if folder.is_relative_to(root()) and (folder / metadata).is_file()]
+    below = [file.parents[1] for file in path.rglob(str(metadata)) if file != path / metadata]
+    for other in (*above, *below):
+        raise OffbenchError(f"{dataset_id} would share a folder with {other.relative_to(root())}; choose another id")
 
 
 def _size(dataset_id: str) -> str:

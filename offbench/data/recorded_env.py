@@ -19,7 +19,7 @@ from offbench.envs.recipes import load_recipe, names
 CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d{1,6})(?:\.(\d{1,6}))?")  # of a requirement: `>=3.1.0,<3.2.0` has two
 
 
-def make_env(name: str, render_mode: str | None = None) -> Env:
+def make_env(name: str | Path, render_mode: str | None = None) -> Env:
     """Make a dataset's environment, or a recipe's, with the same physics on every MuJoCo version.
 
     Args:
@@ -29,6 +29,7 @@ def make_env(name: str, render_mode: str | None = None) -> Env:
     Raises:
         OffbenchError: there is no such dataset or recipe, it names no environment, or that cannot be made.
     """
+    name = str(name)
     if name in names() or Path(name).suffix == ".toml":
         return environments.make_env(load_recipe(name).env_spec(), render_mode)
     metadata = minari_store.read_metadata(name)

@@ -9,6 +9,7 @@ from offbench.common.errors import OffbenchError
 MARGIN = "contact_margin"
 EARLIER, ADDED = "max", "sum"  # a contact's margin: the larger of its geoms' two, or their sum
 REMOVED_FIELDS = ("apply_api_compatibility", "autoreset")  # fields of Gymnasium before 1.0, which later ones refuse
+LAST_EARLIER = "3.4.0"  # the last release with the earlier rule
 MUJOCO_VERSIONS = {EARLIER: "before 3.5", ADDED: "3.5 and later"}  # that have each rule
 
 

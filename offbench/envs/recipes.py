@@ -114,12 +114,13 @@ def names() -> list[str]:
     return sorted(path.parent.name for path in shipped().glob("*/recipe.toml"))
 
 
-def load_recipe(name: str) -> Recipe:
+def load_recipe(name: str | Path) -> Recipe:
     """Return a shipped recipe by name (`hopper`), or a recipe file by path (`./my-env.toml`).
 
     Raises:
         OffbenchError: no such recipe, not TOML, an unknown key, a wrong type or value.
     """
+    name = str(name)
     if name.endswith(".toml") or "/" in name:
         return read_recipe(Path(name), folder=None)
     path = shipped() / name / "recipe.toml"

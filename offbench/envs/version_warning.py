@@ -9,11 +9,11 @@ from offbench.common.terminal import warn
 def warn_other_physics(what: str, recorded: dict[str, str], spec: str) -> None:
     """Print a warning when `what` was made on a MuJoCo that simulates an environment (EnvSpec JSON) differently."""
     made, here = recorded.get("mujoco", ""), versions()["mujoco"]
-    if made and not _same_physics(made, here, spec):
+    if made and not same_physics(made, here, spec):
         warn(f"{what} was made with mujoco {made}, installed is {here}: the physics differ, scores may not compare")
 
 
-def _same_physics(a: str, b: str, spec: str) -> bool:
+def same_physics(a: str, b: str, spec: str) -> bool:
     """Return whether two MuJoCo versions simulate an environment alike; see offbench.envs.contact_margins."""
     from offbench.envs.contact_margins import RK4_ROTATIONS_SINCE, model_of, release, rotations_changed
     from offbench.envs.environments import make_env

@@ -60,7 +60,7 @@ class Evaluation:
 def evaluate(
     path: str | Path,
     *,
-    env: str | None = None,
+    env: str | Path | None = None,
     episodes: int = 10,
     seed: int = 0,
     stochastic: bool = False,
@@ -116,7 +116,7 @@ def _registered(env_id: str, path: Path) -> str:
     return name
 
 
-def open_policy(path: Path, env: str | None = None) -> tuple[Policy, RunConfig | None, str]:
+def open_policy(path: Path, env: str | Path | None = None) -> tuple[Policy, RunConfig | None, str]:
     """Return the policy of a run's folder or a policy file, the run's config (None for a file) and its EnvSpec.
 
     Args:

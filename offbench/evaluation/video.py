@@ -43,7 +43,7 @@ def video(
     path: str | Path,
     *,
     out: str | Path = "video.gif",
-    env: str | None = None,
+    env: str | Path | None = None,
     episodes: int = 1,
     seconds: float | None = None,
     seed: int = 0,
@@ -93,7 +93,7 @@ def video(
     return target
 
 
-def _policy_of(path: str, env: str | None) -> tuple[Policy, str, bool]:
+def _policy_of(path: str, env: str | Path | None) -> tuple[Policy, str, bool]:
     """Return the policy, its EnvSpec and whether its actions are sampled."""
     name, colon, level = path.rpartition(":")
     if not colon or Path(path).exists():

@@ -179,7 +179,9 @@ class Policy:
         """Return mean and std [n, act] of the actions before tanh or the bounds."""
         out = _forward(self._double.actor, x, self.activation)
         mean, log_std = out[:, : len(self.low)], out[:, len(self.low) :]
-        return mean, np.asarray(np.exp(_clip(log_std, LOG_STD_MIN, LOG_STD_MAX)))
+        if self.kind != "gaussian":
+            log_std = _clip(log_std, LOG_STD_MIN, LOG_STD_MAX)
+        return mean, np.exp(log_std)
 
     def to_bytes(self) -> bytes:
         """Return the policy file's content."""

@@ -30,7 +30,7 @@ from offbench.common.errors import SHOW_TRACEBACK, OffbenchError
 from offbench.common.processes import closing, start_errors, start_worker, uninterrupted_start
 from offbench.common.scores import interval
 from offbench.common.seeds import Purpose
-from offbench.envs.environments import LONGEST_EPISODE, Env, make_env, reason, time_limit
+from offbench.envs.environments import LONGEST_EPISODE, Env, box, make_env, reason, time_limit
 from offbench.rollouts.function_policy import FunctionPolicy
 from offbench.rollouts.policy import Policy, from_bytes
 
@@ -118,6 +118,7 @@ class _RunningEpisode:
         self.env, self.policy, self.slot = env, policy, slot
         self.seed = seeds.integer(task.seed, Purpose.RESET, *task.stream, index)
         self.rng = seeds.generator(task.seed, Purpose.ACTION, *task.stream, index)
+        self.space = box(env.action_space, "actions")
         self.limit = time_limit(env.spec) or LONGEST_EPISODE
         self.observations = [reset(env, self.seed)]
         self.actions: list[Array] = []
@@ -135,7 +136,9 @@ class _RunningEpisode:
 
     def step(self, action: Array) -> Episode | None:
         """Take one step; return the whole episode if it was the last one."""
-        action = action.astype(self.env.action_space.dtype)
+        action = action.astype(self.space.dtype)
+        if self.space.dtype != np.float32:  # policies round to float32, which may be beyond these bounds
+            action = np.clip(action, self.space.low, self.space.high)
         observation, reward, terminated, truncated = step(self.env, action.copy())  # it may change its copy
         self.observations.append(observation)
         self.actions.append(action)

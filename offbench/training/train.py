@@ -32,7 +32,7 @@ def train(
     algorithm: str | type[Algorithm],
     dataset: str | Sequence[str],
     *,
-    env: str | None = None,
+    env: str | Path | None = None,
     download: bool = False,
     seeds: int | Sequence[int] = 0,
     steps: int = 1_000_000,

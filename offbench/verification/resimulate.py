@@ -9,7 +9,7 @@ Runs in worker processes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -35,6 +35,7 @@ class ReplayResult:
     steps: int
     faults: tuple[tuple[str, str], ...] = ()
     end: bool = True  # whether its last step was played, so that its end is checked
+    rounding: bool = False  # whether it differs from its seed on, first in the last bits alone
 
 
 def replay_episode(spec: str, episode: RecordedEpisode, exact: bool, last_unknown: bool) -> ReplayResult:
@@ -47,7 +48,14 @@ def replay_episode(spec: str, episode: RecordedEpisode, exact: bool, last_unknow
     """
     env = cached_envs(spec, 1)[0]
     if episode.seed is not None and exact and not last_unknown:
-        return _from_seed(env, episode, 0.0)
+        from_seed = _from_seed(env, episode, 0.0)
+        if not from_seed.rounding:
+            return from_seed
+        state = _StateSetter.of(env)
+        if state is None:
+            return ReplayResult(episode.index, "none", 0, rounding=True)
+        steps = _one_step(env, state, episode, exact, last_unknown)
+        return replace(steps, rounding=not steps.faults)
     state = _StateSetter.of(env)
     if state is not None:
         return _one_step(env, state, episode, exact, last_unknown)
@@ -70,6 +78,8 @@ def _from_seed(env: Env, e: RecordedEpisode, tolerance: float) -> ReplayResult:
     first_off = int(np.flatnonzero(differs)[0]) if differs.any() else None
     end_fault = ("steps-after-end", f"the environment ends at step {steps} of {len(e)}")
     if first_off is not None:
+        if not _rows_differ(played[[first_off]], e.observations[[first_off]], WHOLE).any():
+            return ReplayResult(e.index, "seed", first_off, rounding=True)
         # only the row after the environment's own end differs: the next episode begins there
         fault = end_fault if first_off == steps < len(e) else _diagnose(env, played, e, first_off, tolerance)
         return ReplayResult(e.index, "seed", steps, (fault,))

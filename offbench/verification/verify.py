@@ -204,6 +204,11 @@ def _add_replays(replays: Sequence[ReplayResult], mujoco: str | None, report: Re
         if played:
             steps = sum(replay.steps for replay in played)
             report.checked.append(f"{counted(len(played), 'episode')} played again {method}: {counted(steps, 'step')}")
+    if rounding := sum(replay.rounding for replay in replays):
+        report.warnings.append(
+            f"{counted(rounding, 'episode')} played from their seeds differ in the last bits first, and then more and "
+            "more: another processor or C library rounds differently"
+        )
     open_ends = sum(replay.how != "none" and not replay.end for replay in replays)
     if open_ends:
         text = f"the {'ends' if open_ends > 1 else 'end'} of {counted(open_ends, 'episode')}"

@@ -78,8 +78,8 @@ def test_the_fractions_that_are_named_are_recorded(
     ladder_at: Callable[[dict[str, float]], tuple[str, Path]],
 ) -> None:
     recipe, folder = ladder_at({"medium": 0.36, "a": 0.72, "expert": 1.0})
-    for level, fraction in {"0.36": 0.36, "0.72": 0.72, "0.75": 0.72}.items():
-        name = offbench.collect(recipe, level, steps=200, behaviour_dir=folder, workers=1)
+    for level, fraction in (("0.36", 0.36), (0.72, 0.72), ("0.75", 0.72)):
+        name = offbench.collect(Path(recipe), level, steps=200, behaviour_dir=folder, workers=1)
         assert metadata_of(name)["offbench"]["parts"][0]["fraction"] == fraction
 
 
@@ -147,6 +147,32 @@ def test_random_actions_need_no_agent(tiny: tuple[str, str], home: Path, monkeyp
     assert after["offbench"]["references"]["random"] == before["offbench"]["references"]["random"]
     assert np.isclose(after["ref_max_score"], after["offbench"]["references"]["expert"]["return"])
     assert metadata_of("mixed-v0")["offbench"]["content_sha256"] == before["offbench"]["content_sha256"]
+
+
+def test_no_dataset_is_recorded_inside_another(home: Path, tiny: tuple[str, str]) -> None:
+    offbench.collect(tiny[0], "random", dataset_id="a-v0", workers=1)
+    with pytest.raises(OffbenchError, match="a-v0/b-v0 would share a folder with a-v0; choose another id"):
+        offbench.collect(tiny[0], "random", dataset_id="a-v0/b-v0", workers=1)
+    shutil.copytree(home / "minari" / "a-v0", home / "minari" / "a-v0" / "b-v0")
+    with pytest.raises(OffbenchError, match="a-v0 would share a folder with a-v0/b-v0"):
+        offbench.collect(tiny[0], "random", dataset_id="a-v0", overwrite=True, workers=1)
+    assert minari_store.exists("a-v0/b-v0")
+
+
+def test_a_recipe_that_measures_otherwise_than_its_agent_was_is_noted(
+    home: Path, tiny: tuple[str, str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    recipe = home / "tiny.toml"
+    recipe.write_text("replay_envs = 1\n" + Path(tiny[0]).read_text())
+    offbench.collect(recipe, "medium", behaviour_dir=tiny[1], workers=1)
+    assert "measured with other settings than the recipe's (replay_envs)" in capfd.readouterr().err
+
+
+def test_agents_of_other_seeds_are_named(home: Path, tiny: tuple[str, str], capfd: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(tiny[1], home / "behaviour")
+    (home / "behaviour" / "tiny" / "seed-0").rename(home / "behaviour" / "tiny" / "seed-3")
+    offbench.collect(tiny[0], "medium", workers=1)
+    assert "no behaviour agent of seed 0 (there is seed-3" in capfd.readouterr().err
 
 
 def test_random_is_recorded_once(tiny: tuple[str, str], capfd: pytest.CaptureFixture[str]) -> None:

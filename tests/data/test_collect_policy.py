@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import minari
 import numpy as np
 import pytest
 import torch
@@ -162,6 +163,61 @@ def test_what_is_recorded_is_what_the_policy_does(home: Path, tiny: tuple[str, s
     other = offbench.collect(recipe, policy="mine.safetensors", steps=200, behaviour_dir=behaviour_dir, workers=1)
     assert other == "tiny-mine-v0"
     assert offbench.load(other).content == data.content
+
+
+def test_a_policy_of_another_task_is_noted(
+    home: Path, tiny: tuple[str, str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    _, path = saved("td3", home)
+    for env_id, noted in (("InvertedPendulum-v4", False), ("Other-v5", True)):
+        read_sb3_zip(path, LOW, HIGH, env_id).save(home / "mine.safetensors")
+        offbench.collect(tiny[0], policy="mine.safetensors", steps=60, overwrite=True, workers=1)
+        message = f"mine.safetensors was trained for {env_id}, and is recorded in {ENV}"
+        assert (message in capfd.readouterr().err) is noted
+
+
+def test_ppo_with_a_large_spread_acts_as_in_sb3(home: Path, rng: np.random.Generator) -> None:
+    wide = gym.wrappers.RescaleAction(gym.make(ENV), np.float32(-1000), np.float32(1000))
+    model = PPO("MlpPolicy", wide, policy_kwargs={"log_std_init": 4.0}, device="cpu")
+    model.save(home / "wide.zip")
+    policy = read_sb3_zip(home / "wide.zip", LOW * 1000 / 3, HIGH * 1000 / 3, ENV)
+    observations = np.zeros((4000, 4), np.float32)
+    expected, _ = model.predict(observations)
+    spread = np.std(policy(observations, rng))
+    assert spread == pytest.approx(np.std(expected), rel=0.1)
+    assert spread == pytest.approx(np.exp(4.0), rel=0.1)
+
+
+def test_actions_stay_inside_bounds_that_are_not_float32(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (home / "narrow.py").write_text(
+        """import gymnasium as gym
+import numpy as np
+
+
+class Narrow(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float64)
+    action_space = gym.spaces.Box(-0.1, 0.1, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        return np.zeros(1), 0.0, False, False, {}
+
+
+def highest(o):
+    return [0.1]
+
+
+gym.register("Narrow-v0", "narrow:Narrow", max_episode_steps=20)
+"""
+    )
+    (home / "narrow.toml").write_text('env_id = "narrow:Narrow-v0"\n')
+    monkeypatch.syspath_prepend(str(home))
+    dataset = offbench.collect(home / "narrow.toml", policy="narrow:highest", name="highest", steps=60, workers=1)
+    assert (minari.load_dataset(dataset)[0].actions == 0.1).all()
 
 
 def test_a_function_of_ones_own(home: Path, tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,6 +66,25 @@ def slower(env: Any) -> None:
     env.model.opt.timestep *= 1.01
 
 
+def rounded_otherwise(env: Any) -> None:
+    """Let every step begin with an error in the last bits, as on a processor that rounds otherwise."""
+    step = env.step
+
+    def step_with_error(action: Any) -> Any:
+        env.data.qvel[0] += 1e-15
+        return step(action)
+
+    env.step = step_with_error
+
+
+@pytest.mark.parametrize("env_id", ["Hopper-v5", "Ant-v5"])
+def test_another_processors_rounding_is_a_warning(env_id: str) -> None:
+    report = verify(recorded("rounded-v0", env_id, rounded_otherwise), workers=1)
+    assert report.ok, report.lines()
+    assert any("4 episodes played again one step at a time" in line for line in report.checked)
+    assert any("4 episodes played from their seeds differ in the last bits first" in w for w in report.warnings)
+
+
 @pytest.mark.parametrize("seeded", [True, False])
 @pytest.mark.parametrize("change", [heavier, slower])
 def test_other_physics(change: Callable[[Any], None], seeded: bool) -> None:
