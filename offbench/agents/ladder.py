@@ -17,11 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
+from offbench.common.code_hash import changes
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, damage, disk_errors, exclusive_lock, open_regular, read_json
 from offbench.common.scores import LARGEST_VALUE, are_references, normalize
 from offbench.common.settings import read_back
 from offbench.common.terminal import inform, warn
+from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import same_environment
 from offbench.envs.margin_rule import EARLIER
 from offbench.envs.recipes import Recipe, load_recipe, names
@@ -66,6 +68,7 @@ class LadderInfo:
     Attributes:
         references: `return`, its interval `low` to `high`, and `episodes` of the policies `random` and `expert`.
         levels: the steps of the rungs `medium` and `expert`.
+        env_code: hashes of the environment's code and files when the training began.
         seed, steps, hours, sac, hardware, versions, command: of the training.
     """
 
@@ -75,6 +78,7 @@ class LadderInfo:
     levels: dict[str, int]
     medium_replay: Replay
     contact_margin: str = EARLIER
+    env_code: dict[str, str] = field(default_factory=dict)
     seed: int = 0
     steps: int = 0
     hours: float = 0.0
@@ -191,6 +195,11 @@ def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool =
     if ladder is None:
         return None
     ladder.check(recipe)
+    if changed := changes(ladder.info.env_code, environment_code(recipe.env_spec())):
+        raise OffbenchError(
+            f"the behaviour agent in {ladder.folder.parent} was trained in other code of its environment: {changed}; "
+            "delete that folder to train it again"
+        )
     if not shipped:
         inform(f"using the behaviour agent trained here: {ladder.folder}")
         _warn_other_recipe(ladder, recipe)

@@ -35,6 +35,7 @@ from offbench.agents.sac_checkpoint import restore, save_segment_end, save_withi
 from offbench.agents.sb3_zip import sac_layers
 from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common import checkpoints, seeds
+from offbench.common.code_hash import changes
 from offbench.common.errors import OffbenchError
 from offbench.common.files import (
     JsonObject,
@@ -49,6 +50,7 @@ from offbench.common.progress import Progress, duration
 from offbench.common.provenance import hardware, versions
 from offbench.common.seeds import Purpose
 from offbench.common.terminal import warn
+from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import Env, make_env
 from offbench.envs.margin_rule import EARLIER
 from offbench.envs.recipes import Recipe, SACSettings
@@ -88,13 +90,16 @@ def _check_identity(folder: TrainingFolder) -> None:
     identity = {"seed": folder.seed, "env_id": recipe["env_id"], "env_kwargs": dict(recipe["env_kwargs"])}
     identity["contact_margin"] = recipe["contact_margin"]
     identity["sac"] = recipe["sac"] | {"hidden": list(recipe["sac"]["hidden"])}
-    path = folder.path / "training.json"
+    path, code = folder.path / "training.json", environment_code(folder.recipe.env_spec())
     if not path.exists():
-        write_json(
-            path, identity | {"recipe_sha256": folder.recipe.sha256(), "versions": versions(), "hardware": hardware()}
-        )
+        made = {"recipe_sha256": folder.recipe.sha256(), "versions": versions(), "hardware": hardware()}
+        write_json(path, identity | {"env_code": code} | made)
         return
     recorded = read_json(path, f"delete {folder.path} to train the agent again")
+    if edited := changes(recorded.get("env_code", {}), code):
+        raise OffbenchError(
+            f"the training in {folder.path} began in other code of its environment: {edited}; delete it to train again"
+        )
     recorded = {"contact_margin": EARLIER} | recorded  # the only rule of earlier versions
     started = _flattened({key: value for key, value in recorded.items() if key in identity})
     wanted = _flattened(json.loads(json.dumps(identity)))

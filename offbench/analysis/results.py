@@ -20,6 +20,7 @@ import numpy as np
 from offbench.analysis.evaluated_run import EvaluatedRun, keys_with_mixed_code
 from offbench.analysis.methods import Method, find_method, method_order, name_methods, rank
 from offbench.common.arrays import Array
+from offbench.common.code_hash import changes
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import READ_REMEDIES
 from offbench.common.scores import SCORED_EVALUATIONS, mean_std
@@ -290,7 +291,7 @@ def _tasks(
     ids = [dataset for dataset, _ in runs]
     tasks = {}
     for (dataset, content), group in runs.items():
-        kinds = {(t.config.env_spec, *t.config.references.items()): t for t in group}
+        kinds = {(t.config.env_spec, *t.config.references.items(), *t.config.env_code.items()): t for t in group}
         for one, other in itertools.combinations(kinds.values(), 2) if compared else ():
             _check_evaluated_alike(one, other)
         references = [name for name in ("dataset", "d4rl") if all(t.config.references.get(name) for t in group)]
@@ -305,11 +306,13 @@ def _check_evaluated_alike(one: EvaluatedRun, other: EvaluatedRun) -> None:
         differ = "were evaluated in different environments"
     elif any(pair and b.references.get(name) not in (None, pair) for name, pair in a.references.items()):
         differ = "have different reference scores"
+    elif changes(a.env_code, b.env_code):
+        differ = "were evaluated in environments of different code"
     else:
         return
     raise OffbenchError(
-        f"{one.run.folder} and {other.run.folder} are runs on the same data but {differ} (see env_spec and references "
-        "in their config.json), so their scores do not compare; give a folder without one of them"
+        f"{one.run.folder} and {other.run.folder} are runs on the same data but {differ} (see env_spec, env_code "
+        "and references in their config.json), so their scores do not compare; give a folder without one of them"
     )
 
 

@@ -44,6 +44,7 @@ class Provenance:
         full_size: transitions at the recipe's size.
         references: the episodes behind `ref_min_score` (`random`) and `ref_max_score` (`expert`).
         d4rl: D4RL's reference scores.
+        env_code: hashes of the environment's code and files, if it is not Gymnasium's.
         imported: the D4RL file that the dataset was imported from.
         timeouts: of an import: whether the steps at a timeout are `kept` or `dropped`.
         final_observations: of an import: whether the last observations of terminated episodes are `kept`, or the
@@ -59,6 +60,7 @@ class Provenance:
     references: JsonObject = field(default_factory=dict)
     d4rl: tuple[float, float] | None = None
     contact_margin: str | None = setting(None, "", choices=(EARLIER, ADDED))
+    env_code: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     content_sha256: str | None = None
     imported: JsonObject = field(default_factory=dict)

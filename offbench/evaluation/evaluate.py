@@ -10,11 +10,14 @@ import gymnasium as gym
 import numpy as np
 
 from offbench.agents.ladder import shipped_references
+from offbench.common.code_hash import changes
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import default_workers
 from offbench.common.scores import interval, mean_std, normalize
 from offbench.common.seeds import Purpose, check_seed
+from offbench.common.terminal import warn
 from offbench.common.text import counted
+from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import checked_spec, env_spec, same_environment
 from offbench.envs.margin_rule import ADDED, MUJOCO_VERSIONS, without_margin
 from offbench.envs.recipes import d4rl_reference, load_recipe
@@ -137,4 +140,7 @@ def open_policy(path: Path, env: str | Path | None = None) -> tuple[Policy, RunC
         text = env_spec(_registered(policy.env_id, path))
     else:
         raise OffbenchError(f"{path} names no environment; give one with --env")
-    return policy, config, checked_spec(text, str(path), len(policy.observation_mean), policy.low, policy.high)
+    spec = checked_spec(text, str(path), len(policy.observation_mean), policy.low, policy.high)
+    if env is None and config and (changed := changes(config.env_code, environment_code(spec))):
+        warn(f"the code of {path}'s environment has changed since it was trained: {changed}")
+    return policy, config, spec

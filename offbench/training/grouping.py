@@ -24,6 +24,7 @@ from offbench.data import transitions
 from offbench.data.minari_store import provenance
 from offbench.data.recorded_env import report_margin_rule
 from offbench.data.transitions import Transitions
+from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import checked_spec, same_environment
 from offbench.envs.recipes import d4rl_reference
 from offbench.envs.version_warning import warn_other_physics
@@ -222,6 +223,7 @@ def run_config(spec: RunSpec, data: Transitions, device: str, command: str) -> R
         references={"dataset": data.references, "d4rl": d4rl_reference(data.env_spec)},
         env_id=data.env_id,
         env_spec=data.env_spec,
+        env_code=environment_code(data.env_spec) if data.env_spec else {},
         command=command.encode("utf-8", "backslashreplace").decode(),  # a path may hold bytes that are not UTF-8
         code=code_of(spec.algorithm),
         **training_platform(device, spec.precision),

@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from offbench.common.code_hash import changes
 from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import (
     csv_bytes,
@@ -37,7 +38,6 @@ from offbench.common.scores import LARGEST_VALUE, Evaluations, check_steps
 from offbench.common.settings import read_back
 from offbench.training.registry import current_settings
 from offbench.training.run_config import FORMAT, RunConfig, Session
-from offbench.training.source_code import changes
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 DELETE_TO_REPEAT = "delete the run to repeat it"
@@ -105,7 +105,8 @@ class Run:
 
     def check_claimed(self, config: RunConfig) -> None:
         """Check, with the lock held, that this is the run of `config`, of any code. Raises OffbenchError if not."""
-        if reason := self._mismatch(dataclasses.replace(config, code=self.config().code)):
+        now = self.config()
+        if reason := self._mismatch(dataclasses.replace(config, code=now.code, env_code=now.env_code)):
             raise OffbenchError(f"{reason}; run the command again")
 
     def claim(self, config: RunConfig) -> None:
@@ -166,7 +167,10 @@ class Run:
                 return f"{self.folder} was started with {flag} {old}, not {new} (to continue it, give {flag} {old})"
             return f"{self.folder} was started with {key} {old}, not {new}"
         changed = changes(existing.code, config.code)
-        return f"{self.folder} was trained by other code of {config.algorithm}: {changed}" if changed else ""
+        if changed:
+            return f"{self.folder} was trained by other code of {config.algorithm}: {changed}"
+        changed = changes(existing.env_code, config.env_code)
+        return f"{self.folder} was evaluated in other code of its environment: {changed}" if changed else ""
 
     def clear(self) -> None:
         """Delete what the folder holds, if it holds a run, so that it is trained again; config.json goes last."""

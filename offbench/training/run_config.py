@@ -36,6 +36,7 @@ class RunConfig:
         dataset_sha256: the content hash of the dataset.
         references: (random, expert) returns by name: `dataset`, its own, and `d4rl`, D4RL's constants.
         env_spec: the environment it is evaluated in, as EnvSpec JSON; None if the dataset names none.
+        env_code: hashes of that environment's code and files, if it is not Gymnasium's; empty in earlier versions.
         device, precision, versions, hardware: of the first session.
         code: hashes of the algorithm's files (offbench.training.source_code); empty in runs of earlier versions.
         sessions: the later sessions that were trained with something else.
@@ -55,6 +56,7 @@ class RunConfig:
     references: dict[str, tuple[float, float] | None]
     env_id: str = ""
     env_spec: str | None = None
+    env_code: dict[str, str] = field(default_factory=dict)
     command: str = ""
     device: str = ""
     precision: str = ""

@@ -15,9 +15,9 @@ import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from offbench.common.code_hash import MAIN
 from offbench.common.files import sha256
 
-MAIN = "__main__: "  # begins the names of what a class uses
 PLAIN = (bool, int, float, complex, str, bytes, type(None))
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from offbench.algorithm.interface import Algorithm
 from offbench.common import checkpoints
+from offbench.common.code_hash import changes
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import check_seed
 from offbench.common.settings import build, without_numpy
@@ -23,7 +24,7 @@ from offbench.training.jobs import raise_first, run_jobs
 from offbench.training.loggers import NO_DESTINATIONS, Destinations
 from offbench.training.registry import algorithm_names, current_settings, is_local, load_algorithm, register
 from offbench.training.run import Run
-from offbench.training.source_code import changes, code_of
+from offbench.training.source_code import code_of
 from offbench.training.spec import Job, RunSpec, Times, settings_json, specs_of
 from offbench.training.stack import Stack, check_origin
 

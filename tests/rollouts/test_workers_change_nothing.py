@@ -25,7 +25,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.processes import uninterrupted_start
 from offbench.common.seeds import Purpose
 from offbench.data import minari_store
-from offbench.data.collect import cut_at
+from offbench.data.recording import cut_at
 from offbench.envs.environments import env_spec, make_env
 from offbench.rollouts.policy import uniform
 from offbench.rollouts.rollouts import (

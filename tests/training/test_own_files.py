@@ -17,11 +17,13 @@ import pytest
 import offbench
 from offbench.analysis.results import read_results
 from offbench.cli.main import main
+from offbench.common import code_hash
+from offbench.common.code_hash import changes
 from offbench.common.errors import OffbenchError
 from offbench.reports.tables import score_table
 from offbench.training import registry, source_code
 from offbench.training.run import Run
-from offbench.training.source_code import changes, code_of
+from offbench.training.source_code import code_of
 from offbench.training.train import restore
 from tests.cli.test_bad_input import refusal
 from tests.conftest import ROOT, forget_modules
@@ -393,4 +395,4 @@ def test_the_hash_of_f_strings_is_the_same_in_all_versions_of_python() -> None:
     tokens = ["def", "update", "(", "x", ",", "width", ")", ":", "", "    ", ""]
     tokens += ["print", "(", 'f"{x!r:>{width}} {{}}"', ",", r"rf'\{x:{width}.3}'", '"plain"', ")", ""]
     tokens += ["return", "f'''{x + 1\n    } and {f\"{x}\"}'''", "", ""]
-    assert list(source_code._tokens(F_STRINGS)) == tokens
+    assert list(code_hash._tokens(F_STRINGS)) == tokens

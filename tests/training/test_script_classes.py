@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 import offbench
+from offbench.common.code_hash import MAIN, changes
 from offbench.common.errors import OffbenchError
 from offbench.training import registry
-from offbench.training.script_code import MAIN
-from offbench.training.source_code import changes, code_of
+from offbench.training.source_code import code_of
 
 SCRIPT = """
 from offbench.algos.bc import BC

@@ -1,0 +1,196 @@
+"""Recording: the episodes of a dataset's parts, and which policy plays each part."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from collections.abc import Iterator
+
+from offbench.agents.build_ladder import random_reference
+from offbench.agents.ladder import MEDIUM, MEDIUM_AT_MOST, MEDIUM_LIMITS, NEAR, Ladder, Rung
+from offbench.agents.medium_replay import load_replay
+from offbench.common.errors import OffbenchError
+from offbench.common.files import JsonObject, sha256
+from offbench.common.terminal import inform
+from offbench.data.behaviour_policy import BehaviourPolicy, read_behaviour_policy
+from offbench.data.levels import Part, full_size, shares
+from offbench.envs.contact_margins import has_margins, model_of
+from offbench.envs.environments import make_env, spaces_of
+from offbench.envs.recipes import Recipe
+from offbench.rollouts.function_policy import FunctionPolicy
+from offbench.rollouts.policy import Policy, uniform
+from offbench.rollouts.rollouts import Episode, Rollouts
+
+POLICY = "policy"  # the source of a part that a user's own policy plays
+WITHOUT_AGENT = ("uniform", POLICY)  # sources that need no behaviour agent
+
+
+class Recording:
+    """What all parts of one dataset share. Without a ladder, only WITHOUT_AGENT parts can be recorded."""
+
+    def __init__(
+        self, recipe: Recipe, ladder: Ladder | None, seed: int, workers: int, policy_source: str | None
+    ) -> None:
+        self.recipe, self._ladder, self.seed = recipe, ladder, seed
+        self.workers = workers if workers > 1 else 0  # a single one would be no faster than this process
+        self.spec = recipe.env_spec()
+        env = make_env(self.spec)
+        model = model_of(env)
+        self.mujoco, self.margins = model is not None, model is not None and has_margins(model)
+        self.spaces = self.observation_space, action_space = spaces_of(env, recipe.env_id)
+        self.bounds = action_space.low, action_space.high
+        self.own_policy: BehaviourPolicy | None = None
+        if policy_source is not None:
+            self.own_policy = read_behaviour_policy(
+                policy_source, *self.bounds, self.observation_space.shape[0], recipe.env_id
+            )
+
+    @property
+    def calls_function(self) -> bool:
+        """Whether the policy is a user's own function, which may keep a state, draw numbers and read files."""
+        return self.own_policy is not None and isinstance(self.own_policy.policy, FunctionPolicy)
+
+    @property
+    def ladder(self) -> Ladder:
+        """The behaviour agent's ladder."""
+        assert self._ladder is not None
+        return self._ladder
+
+    @functools.cached_property
+    def references(self) -> JsonObject:
+        """The random and the expert reference; without a ladder the random one, measured here as a ladder's is."""
+        if self._ladder:
+            return dict(self._ladder.info.references)
+        with Rollouts(self.spec, self.workers) as rollouts:
+            return {"random": random_reference(self.recipe, 0, rollouts)}
+
+    def full_size(self, parts: tuple[Part, ...]) -> int:
+        """Return the transitions of a dataset at its full size."""
+        replay_steps = self._ladder.info.medium_replay.transitions if self._ladder else None
+        return full_size(parts, self.recipe.dataset_steps, replay_steps)
+
+    def counts(self, parts: tuple[Part, ...], steps: int | None) -> list[int]:
+        """Return the transitions of each part; `steps` are those of all, None for the full size."""
+        total = self.full_size(parts) if steps is None else steps
+        counts = shares(parts, total)
+        if 0 in counts:
+            raise OffbenchError(f"{total} steps leave a part of the blend without a transition; use more --steps")
+        for part, count in zip(parts, counts, strict=True):
+            if part.source == "replay" and count > (available := self.ladder.info.medium_replay.transitions):
+                raise OffbenchError(
+                    f"medium-replay of {self.recipe.name} has {available:,} transitions, not {count:,}; "
+                    "use fewer --steps"
+                )
+        return counts
+
+    def source(self, part: Part, accept: bool) -> Rung | None:
+        """Return the rung a part is played by, or None for uniform actions and the replay.
+
+        Raises:
+            OffbenchError: no rung is near what the part is defined as, and the user did not accept another.
+        """
+        if part.source in WITHOUT_AGENT:
+            return None
+        if part.source not in ("medium", "replay", "expert"):
+            return self._nearest(float(part.source), accept)
+        rung = self.ladder.role("expert" if part.source == "expert" else "medium")
+        if part.source != "expert":
+            self._check_medium(rung, accept)
+        return None if part.source == "replay" else rung
+
+    def _nearest(self, fraction: float, accept: bool) -> Rung:
+        rung = self.ladder.nearest(fraction)
+        where = self.ladder.fraction(rung)
+        if abs(where - fraction) > NEAR and not accept:
+            near = " and ".join(f"{self.ladder.fraction(r):.2f}" for r in self.ladder.neighbors(fraction))
+            raise OffbenchError(
+                f"{self.recipe.name} has no policy within {NEAR} of {fraction:g} of the expert's return; the nearest: "
+                f"{near}; use such a fraction, or `offbench collect --accept` to record the nearest"
+            )
+        inform(
+            f"the policy nearest {fraction:g} is the one of step {rung.step:,}: return {rung.ret:.0f}, "
+            f"{where:.2f} of the expert's"
+        )
+        return rung
+
+    def _check_medium(self, rung: Rung, accept: bool) -> None:
+        fraction = self.ladder.fraction(rung)
+        if MEDIUM <= fraction <= MEDIUM_AT_MOST:
+            return
+        low, high = MEDIUM_LIMITS
+        message = f"medium of {self.recipe.name} is at {fraction:.2f} of the expert's return"
+        if not low <= fraction <= high and not accept:
+            raise OffbenchError(f"{message}, far from {MEDIUM:.2f}; `offbench collect --accept` records it anyway")
+        remedy = "" if self.recipe.folder else "; a shorter [sac] segment in the recipe keeps more policies"
+        inform(f"{message}: no policy of the training is at {MEDIUM:.2f} to {MEDIUM_AT_MOST}{remedy}")
+
+    def policy(self, rung: Rung | None) -> Policy | FunctionPolicy:
+        """Return the policy that plays a part."""
+        if self.own_policy is not None:
+            return self.own_policy.policy
+        if rung is not None:
+            return self.ladder.load(rung)
+        return uniform(*self.bounds, self.observation_space.shape[0], self.recipe.env_id)
+
+    def episodes(self, part: Part, rung: Rung | None, count: int, index: int) -> Iterator[Episode]:
+        """Yield a part's episodes with exactly `count` transitions; the last one is cut short."""
+        if part.source == "replay":
+            expected = self.ladder.info.medium_replay.sha256
+            yield from cut_at(load_replay(self.ladder.replay, expected, self.observation_space, *self.bounds), count)
+            return
+        with (
+            Rollouts(self.spec, 0 if self.calls_function else self.workers) as rollouts,
+            # the part is in the seed, so that both halves of medium-expert have their own episodes
+            contextlib.closing(
+                rollouts.episodes(self.policy(rung), self.seed, (index,), transitions_needed=count)
+            ) as endless,
+        ):
+            yield from cut_at(endless, count)
+
+    def origin_text(self, part: Part, rung: Rung | None) -> str:
+        """Return how a part was recorded, for the dataset's description."""
+        if part.source == "uniform":
+            return "uniform-random actions"
+        if self.own_policy is not None:
+            return f"the policy {self.own_policy.source}"
+        if rung is None:
+            fraction = self.ladder.fraction(self.ladder.role("medium"))
+            info, which = self.ladder.info, ""
+            if info.medium_replay.envs:
+                which = f" ({info.medium_replay.envs} of its {info.sac['envs']} environments)"
+            until = f"up to its medium policy, at {fraction:.2f} of the expert's return"
+            return f"the replay of SAC's training{which} {until}"
+        fraction = self.ladder.fraction(rung)
+        return f"SAC's policy of training step {rung.step}, at {fraction:.2f} of the expert's return"
+
+    def describe(self, part: Part, rung: Rung | None, count: int) -> JsonObject:
+        """Return a part's definition as measured, for the metadata."""
+        described: JsonObject = {"source": part.source, "transitions": count}
+        if part.source == "replay":
+            medium = self.ladder.info.levels["medium"]
+            return described | {"training_steps": medium, "sha256": self.ladder.info.medium_replay.sha256}
+        if self.own_policy is not None:
+            made = {"policy": self.own_policy.source, "algorithm": self.own_policy.algorithm}
+            return described | made | {"policy_sha256": self.own_policy.sha256}
+        if rung is None:
+            random = self.references["random"]
+            return described | {"return": random["return"], "interval": [random["low"], random["high"]]}
+        return described | {
+            "rung": rung.step,
+            "return": rung.ret,
+            "interval": [rung.low, rung.high],
+            "episodes": rung.episodes,
+            "fraction": round(self.ladder.fraction(rung), 4),
+            "target": {"medium": [round(MEDIUM, 4), MEDIUM_AT_MOST], "expert": "best"}.get(part.source, part.source),
+            "policy_sha256": sha256((self.ladder.folder / "policies" / rung.policy).read_bytes()),
+        }
+
+
+def cut_at(episodes: Iterator[Episode], count: int) -> Iterator[Episode]:
+    """Yield episodes until they hold exactly `count` transitions; the last one is truncated where it must be."""
+    left = count
+    for episode in episodes:
+        yield episode.cut(left)
+        left -= min(left, len(episode))
+        if not left:
+            return

@@ -1,0 +1,43 @@
+"""The code and files of an environment that is not Gymnasium's own: what its datasets and runs depend on."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from offbench.common.code_hash import module_code
+from offbench.common.files import sha256
+
+LEFT_OUT = ("gymnasium", "offbench", "builtins", "abc", "typing")  # a version is recorded of these, or Python has them
+
+
+def environment_code(spec: str) -> dict[str, str]:
+    """Return {file: hash} of what an environment (EnvSpec JSON) is made of, {} for one of Gymnasium.
+
+    It covers the modules of its class, base classes and wrappers, and files that its arguments name, such as MuJoCo
+    models.
+    """
+    fields, hashes = json.loads(spec), dict[str, str]()
+    for part in (fields, *(fields.get("additional_wrappers") or ())):
+        module, _, name = str(part["entry_point"]).partition(":")
+        if module.partition(".")[0] not in LEFT_OUT:
+            hashes |= _code(getattr(importlib.import_module(module), name))
+        for value in (part.get("kwargs") or {}).values():
+            if isinstance(value, str) and os.path.isfile(value):
+                hashes[os.path.basename(value)] = sha256(Path(value).read_bytes())
+    return dict(sorted(hashes.items()))
+
+
+@functools.cache  # as it was imported: its files may change later
+def _code(factory: type | Callable[..., object]) -> dict[str, str]:
+    classes = factory.__mro__ if isinstance(factory, type) else (factory,)
+    hashes: dict[str, str] = {}
+    for module in {cls.__module__ for cls in classes}:
+        if module.partition(".")[0] not in LEFT_OUT and getattr(sys.modules[module], "__file__", None):
+            hashes |= module_code(module)
+    return hashes

@@ -1,0 +1,116 @@
+"""An edit of an environment's code is noticed by everything that was made with it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+
+import offbench
+from offbench.analysis.results import read_results
+from offbench.common.errors import OffbenchError
+from offbench.envs.environment_code import environment_code
+from offbench.envs.environments import env_spec
+from offbench.training.run import Run
+from tests.conftest import TINY_RECIPE, forget_modules
+
+ENVIRONMENT = """
+import gymnasium as gym
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
+
+from gains import GAIN
+
+
+class Pushed(InvertedPendulumEnv):
+    def step(self, action):
+        return super().step(GAIN * action)
+
+
+gym.register("Pushed-v0", "pushed:Pushed", max_episode_steps=100)
+"""
+SMALL: dict[str, Any] = {"eval_every": 2, "eval_episodes": 1, "hidden": (8,), "batch_size": 4, "workers": 1}
+
+
+@pytest.fixture
+def recipe(home: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A recipe of an environment in two modules of the working directory."""
+    (home / "pushed.py").write_text(ENVIRONMENT)
+    (home / "gains.py").write_text("GAIN = 1.0\n")
+    (home / "pushed.toml").write_text(
+        TINY_RECIPE.replace("InvertedPendulum-v5", "pushed:Pushed-v0").replace("tiny", "pushed")
+    )
+    monkeypatch.syspath_prepend(str(home))
+    monkeypatch.setenv("OFFBENCH_TRUST", "1")
+    yield home / "pushed.toml"
+    gym.registry.pop("Pushed-v0", None)
+
+
+def edit(home: Path, name: str, text: str) -> None:
+    """Write a module, as if the next command were another process."""
+    (home / name).write_text(text)
+    forget_modules(home)
+    gym.registry.pop("Pushed-v0", None)
+    sys.path_importer_cache.clear()
+
+
+def test_what_is_hashed(home: Path, recipe: Path) -> None:
+    assert environment_code(env_spec("Hopper-v5")) == {}
+    before = environment_code(env_spec("pushed:Pushed-v0"))
+    assert list(before) == ["gains.py", "pushed.py"]
+    edit(home, "gains.py", "# of the motor\nGAIN = 1.0\n")
+    assert environment_code(env_spec("pushed:Pushed-v0")) == before
+    edit(home, "gains.py", "GAIN = 2.0\n")
+    after = environment_code(env_spec("pushed:Pushed-v0"))
+    assert [name for name in before if before[name] != after[name]] == ["gains.py"]
+
+
+def test_a_model_that_an_argument_names_is_hashed(home: Path) -> None:
+    assets = Path(gym.envs.mujoco.__file__).parent / "assets"
+    model = home / "heavy.xml"
+    model.write_bytes((assets / "inverted_pendulum.xml").read_bytes())
+    spec = env_spec("InvertedPendulum-v5", xml_file=str(model))
+    before = environment_code(spec)
+    assert list(before) == ["heavy.xml"]
+    model.write_text(model.read_text().replace('gravity="0 0 -9.81"', 'gravity="0 0 -5"'))
+    assert environment_code(spec) != before
+
+
+def test_an_edit_is_noticed(home: Path, recipe: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    dataset = offbench.collect(recipe, "random", workers=1)
+    offbench.collect(recipe, "medium", workers=1)
+    (folder,) = offbench.train("bc", dataset, steps=2, **SMALL)
+    edit(home, "gains.py", "GAIN = 1.0  # the same\n")
+    offbench.collect(recipe, "medium", workers=1)
+    assert "recorded already" in capfd.readouterr().err
+    edit(home, "gains.py", "GAIN = -1.0\n")
+    with pytest.raises(OffbenchError, match=r"agent in .* was trained in other code of its environment: gains.py has"):
+        offbench.collect(recipe, "expert", workers=1)
+    with pytest.raises(OffbenchError, match=r"began in other code of its environment: gains.py has changed"):
+        offbench.behaviour(recipe, workers=1)
+    (home / "behaviour").rename(home / "old")
+    with pytest.raises(OffbenchError, match=r"pushed-random-v0 was recorded in other code of its env.*: gains.py"):
+        offbench.collect(recipe, "random", workers=1)
+    with pytest.raises(OffbenchError, match=r"was evaluated in other code of its environment: gains.py has changed"):
+        offbench.train("bc", dataset, steps=4, **SMALL)
+    capfd.readouterr()
+    offbench.evaluate(folder, episodes=1, workers=1)
+    assert "environment has changed since it was trained: gains.py" in capfd.readouterr().err
+    offbench.train("bc", dataset, steps=2, seeds=[1], **SMALL)
+    with pytest.raises(OffbenchError, match="evaluated in environments of different code"):
+        read_results("runs")
+
+
+def test_runs_and_ladders_of_earlier_versions_stay_valid(home: Path, recipe: Path) -> None:
+    dataset = offbench.collect(recipe, "random", workers=1)
+    (folder,) = offbench.train("bc", dataset, steps=2, **SMALL)
+    path = Run(folder).config_path
+    text = path.read_text()
+    assert '"env_code"' in text
+    path.write_text(text.replace('"env_code"', '"of_an_earlier_version"'))
+    edit(home, "gains.py", "GAIN = -1.0\n")
+    offbench.train("bc", dataset, steps=4, **SMALL)
+    assert sorted(Run(folder).evaluations()) == [2, 4]
