@@ -3,7 +3,8 @@
     loss = mean (pi(s) - a)^2
 
 A deterministic policy, regressed on the data's actions; `top = 0.1` clones the best tenth of the episodes by return
-only ("10%BC", Chen et al., "Decision Transformer", NeurIPS 2021). Otherwise the settings of TD3+BC.
+only, as "10%BC" of Chen et al., "Decision Transformer", NeurIPS 2021, which counts transitions instead of episodes.
+Otherwise the settings of TD3+BC.
 """
 
 from __future__ import annotations

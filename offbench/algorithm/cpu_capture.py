@@ -180,13 +180,18 @@ class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
         return result
 
 
-def attributes(owner: object) -> dict[str, object]:
+def attributes(owner: object, *, in_place: bool = False) -> dict[str, object]:
     """Return the attributes of an object, to be compared with a later state by `changed_attribute`.
 
     Numbers, texts and the contents of lists, dicts, sets and plain objects count by value, anything else by identity.
-    What a checkpoint keeps, and tensors changed in place, do not count: a replay changes them too.
+    What a checkpoint keeps does not count.
+
+    Args:
+        in_place: whether changes in place of other tensors count, which a replay repeats.
     """
-    return {name: _state(value, frozenset()) for name, value in vars(owner).items()}
+    learned: dict[str, Any] = getattr(owner, "learned", {}) if in_place else {}
+    kept = {_memory(tensor) for part in learned.values() for tensor in part.tensors().values()}
+    return {name: _state(value, frozenset(), kept if in_place else None) for name, value in vars(owner).items()}
 
 
 def changed_attribute(before: dict[str, object], after: dict[str, object], *, first: bool) -> str | None:
@@ -197,28 +202,40 @@ def changed_attribute(before: dict[str, object], after: dict[str, object], *, fi
     """
     for name, value in after.items():
         old = before.get(name)
-        if old != value and not (first and old in (None, _state(None, frozenset()))):
+        if old != value and not (first and old in (None, _state(None, frozenset(), None))):
             return name
     return next((name for name in before if name not in after), None)
 
 
-def _state(value: object, above: frozenset[int]) -> object:
-    """Return the parts of a value that can change, in a form that can be compared."""
+def _memory(tensor: Tensor) -> int:
+    return tensor.untyped_storage().data_ptr()
+
+
+def _state(value: object, above: frozenset[int], kept: set[int] | None) -> object:
+    """Return the parts of a value that can change, in a form that can be compared.
+
+    Args:
+        above: ids of what the value is part of.
+        kept: addresses of tensors that a checkpoint keeps, if changes of others in place count.
+    """
+    if isinstance(value, Tensor):
+        ignored = kept is None or value.is_inference() or _memory(value) in kept
+        return id(value), 0 if ignored else value._version
     if value is None or isinstance(value, bool | int | float | complex | str | bytes):
         return type(value).__name__, repr(value)  # NaN equals itself so
-    if id(value) in above or isinstance(value, type | Tensor) or callable(getattr(value, "tensors", None)):
+    if id(value) in above or isinstance(value, type) or callable(getattr(value, "tensors", None)):
         return id(value)
     inner = above | {id(value)}
     if isinstance(value, dict):
-        return [(repr(key), _state(item, inner)) for key, item in value.items()]
+        return [(repr(key), _state(item, inner, kept)) for key, item in value.items()]
     if isinstance(value, list | tuple | collections.deque):
-        return [_state(item, inner) for item in value]
+        return [_state(item, inner, kept) for item in value]
     if isinstance(value, set | frozenset):
         return sorted(map(repr, value))
     if isinstance(value, np.ndarray):
         return value.shape, str(value.dtype), value.tobytes()
     if hasattr(value, "__dict__"):
-        return id(value), [(name, _state(item, inner)) for name, item in vars(value).items()]
+        return id(value), [(name, _state(item, inner, kept)) for name, item in vars(value).items()]
     return id(value), repr(value)
 
 

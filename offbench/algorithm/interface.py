@@ -248,11 +248,27 @@ def check_logs(logs: object, runs: int, where: str) -> None:
     """Raise OffbenchError unless an update returned logs, each a tensor [runs]; reads only shapes."""
     if not isinstance(logs, Mapping):
         raise OffbenchError(f"{where} must return a dict of logs, not a {type(logs).__name__}")
+    if "step" in logs:
+        raise OffbenchError(f"{where}: 'step' is the column of steps in losses.csv; give that log another name")
     for name, value in logs.items():
         tensor = isinstance(value, Tensor)
         if not tensor or value.shape != (runs,):
             got = f"one {list(value.shape)}" if tensor else f"a {type(value).__name__}"
             raise OffbenchError(f"{where}: log {name!r} must be a tensor [runs] = [{runs}], got {got}")
+
+
+def check_noise_spec(spec: object, where: str) -> None:
+    """Raise OffbenchError unless a noise_spec has names and distributions whose shapes are whole numbers."""
+    items = spec.items() if isinstance(spec, Mapping) else [("", None)]
+    for name, distribution in items:
+        shape = distribution.shape if isinstance(distribution, Distribution) else ("",)
+        if not isinstance(name, str) or not all(isinstance(n, int) and n > 0 for n in shape):
+            raise OffbenchError(
+                f"{where} must return a dict of normal(*shape) and uniform(*shape), with shapes of whole numbers from "
+                f"1, not {name}: {distribution}"
+                if name
+                else f"{where} must return a dict, not {spec!r:.60}"
+            )
 
 
 class _NumbersOrWords(NamedTuple):

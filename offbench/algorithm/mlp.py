@@ -33,6 +33,7 @@ from offbench.algorithm.bfloat16_layer import Bfloat16Layer
 from offbench.algorithm.buffers import Array, rows, rows_with_ones, shared
 from offbench.algorithm.cpu_capture import Call, one_call
 from offbench.algorithm.stacked import layers_of, one_by_one, stacked
+from offbench.common.errors import OffbenchError
 
 _WAY = ContextVar("way", default="numpy")
 NARROW = 64  # a product with fewer inputs or outputs gains nothing from bfloat16 on a CPU
@@ -97,6 +98,8 @@ class _Perceptrons(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():  # create_graph=True: this pass would count as a constant
+            raise OffbenchError("a gradient of a gradient needs a network made with twice_differentiable=True")
         (flat,) = ctx.saved_tensors
         needs = ctx.needs_input_grad[0], ctx.needs_input_grad[4:]
         with one_call() as recording:

@@ -64,6 +64,8 @@ class Parameters:
     def __init__(
         self, flat: Tensor, learning_rate: float | Schedule, *, weight_decay: float = 0.0, scalar: bool = False
     ) -> None:
+        if isinstance(learning_rate, Tensor):
+            raise OffbenchError("a learning rate is a number or a schedule; its setting cannot be per_run")
         self._spare = -flat.shape[-1] % ALIGNED
         self._whole = pad(flat, (0, self._spare)) if self._spare else flat
         self.flat = self._whole[..., : flat.shape[-1]].requires_grad_()
@@ -112,6 +114,10 @@ class Parameters:
 
 def minimize(loss: Tensor, *parts: Parameters, retain_graph: bool = False) -> None:
     """Take one Adam step of each part down the gradient of `loss` [runs]; all gradients come before the steps."""
+    if loss.shape != (runs := parts[0].flat.shape[1],):
+        raise OffbenchError(
+            f"a loss is one number for each run, [runs] = [{runs}], not {list(loss.shape)}: reduce the other axes"
+        )
     grads = torch.autograd.grad(loss.sum(), [part.flat for part in parts], retain_graph=retain_graph)
     for part, grad in zip(parts, grads, strict=True):
         part.adam_step(grad)
@@ -189,6 +195,13 @@ class Network(Parameters):
 
     def forward(self, flat: Tensor, *inputs: Tensor) -> Tensor:
         """Return the outputs of the networks in `flat`, as a call does."""
+        shapes, runs = [list(x.shape) for x in inputs], flat.shape[1]
+        fit = all(len(shape) == 3 and shape[:2] == [runs, shapes[0][1]] for shape in shapes)
+        if not fit or sum(shape[2] for shape in shapes) != self.sizes[0]:
+            raise OffbenchError(
+                f"a network of {runs} runs takes inputs [runs, batch, dim] of {self.sizes[0]} dimensions in all, not "
+                f"{' and '.join(map(str, shapes))}"
+            )
         outputs = perceptrons(flat, inputs, self.sizes, self.activation, self.norm, self.twice_differentiable)
         for axis in self._squeezed:
             outputs = outputs.squeeze(axis)

@@ -138,6 +138,30 @@ def check(cls: type, name: str, value: object, where: str, *, parse: bool = True
     return value
 
 
+def default_of(field: Field) -> object:
+    """Return a field's default, dataclasses.MISSING if it has none."""
+    factory = field.default_factory
+    return field.default if factory is dataclasses.MISSING else factory()
+
+
+def check_declarations(cls: type, where: str) -> None:
+    """Raise OffbenchError if a settings class has a field of a type that settings cannot have, or a bad default."""
+    try:
+        hints = _type_hints(cls)
+    except NameError as error:
+        raise _error(where, f"the type of a setting is unknown: {error}") from None
+    for name, field in fields(cls).items():
+        options = _options(hints[name])
+        if not all(option in _FROM_TEXT or typing.get_origin(option) is tuple for option in options):
+            types_text = "int, float, bool, str, None, tuple[int, ...] and unions of these"
+            raise _error(where, f"the setting {name} is declared as {hints[name]}; settings are {types_text}")
+        words = str in options and not field.metadata.get("choices")
+        if field.metadata.get("per_run") and (words or not {int, float, bool, str}.issuperset(options)):
+            raise _error(where, f"the setting {name} is per_run, so it must be a number, or a word of its choices=")
+        if field.init and (default := default_of(field)) is not dataclasses.MISSING:
+            check(cls, name, default, f"{where}: a default", parse=False)
+
+
 def without_numpy(value: object) -> Any:
     """Return a NumPy number or array as Python's number or list, which JSON can hold; anything else as it is."""
     numpy = sys.modules.get("numpy")  # not imported here, because --help does without it

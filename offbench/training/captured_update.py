@@ -17,6 +17,7 @@ from offbench.training.batches import Store
 Sums = list[tuple[str, float, int]]  # of each logged quantity: its name, its sum, and over how many updates
 # updates of a phase before a replay is trusted on a CPU: all but the first are recorded and compared
 RECORDED_UPDATES = 6
+WATCHED_UPDATES = range(2, 9)  # after which attributes are compared; the first one only tries the code
 RECORD_EVERY = 1000  # updates of a phase between two later records of it
 WARM_UP = 3  # updates of a phase before it is captured on a GPU: libraries allocate workspaces in the first ones
 
@@ -40,6 +41,8 @@ class Program:
         self._graphs: dict[Hashable, torch.cuda.CUDAGraph] = {}
         self._recordings: dict[Hashable, Recording] = {}
         self._done: dict[Hashable, int] = {}  # updates of each phase
+        self._count = 0  # updates in this session
+        self._lost = ""  # an attribute that the updates change and no checkpoint keeps
         self.eager = not algorithm.capture  # whether every update runs without capture
         self._side_stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
 
@@ -54,6 +57,8 @@ class Program:
 
     def run(self, phase: Hashable) -> None:
         """Do the next update."""
+        self._count += 1
+        before = attributes(self.algorithm, in_place=True) if self._count in WATCHED_UPDATES else None
         if self.eager:
             self._update(phase)
         elif self._side_stream is None:
@@ -63,6 +68,19 @@ class Program:
         else:
             self._warm_up(phase, self._side_stream)
         self.counts.update(self._names[phase])
+        if before is not None:
+            self._watch(before)
+
+    def _watch(self, before: dict[str, object]) -> None:
+        """Print which attribute an update changes that no checkpoint keeps, once."""
+        changed = changed_attribute(before, attributes(self.algorithm, in_place=True), first=True)
+        if changed and not self._lost:
+            self._lost = changed
+            name = type(self.algorithm).__name__
+            inform(
+                f"{name}.update changes the attribute {changed}, which no checkpoint keeps: a resumed run begins with "
+                "its first value; keep it in self.parameters, or use phase(step)"
+            )
 
     def _run_captured(self, phase: Hashable) -> None:
         """Do an update on the CPU: the first of a phase eagerly, the next ones recorded, the rest replayed.

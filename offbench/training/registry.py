@@ -17,12 +17,14 @@ import re
 import sys
 import traceback
 import types
+import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, rendering_variable, unknown
 from offbench.common.files import OPEN_FILES, READ_REMEDIES, JsonObject, is_exhausted, is_out_of_memory
+from offbench.common.settings import check_declarations, fields
 from offbench.common.terminal import warn
 
 if TYPE_CHECKING:
@@ -39,7 +41,7 @@ RESERVED_SETTINGS = {
     *("fresh", "help", "label", "name", "precision", "runs", "seeds", "stack", "steps", "tensorboard", "wandb"),
     "workers",
 }
-REQUIRED_SETTINGS = ("batch_size", "normalize")  # settings that the training itself reads
+REQUIRED_SETTINGS = {"batch_size": int, "normalize": bool}  # settings that the training itself reads
 # Settings of earlier versions, each with the value that has no effect. bdb_plus has some of bdb's
 # now; the others lowered the scores and were removed (docs/results.md).
 REMOVED: JsonObject = {"uncertainty": "absolute", "uncertainty_scale": 1.0, "cloning_steps": 0}
@@ -215,14 +217,23 @@ def _from_file(reference: str) -> type[Algorithm]:
         for key, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, Algorithm) and value.__module__ == module.__name__
     }
-    if name in classes:
-        return classes[name]
-    if name or len(classes) != 1:
+    if not name and len(classes) == 1:
+        (name,) = classes
+    if name not in classes:
         what = f"no algorithm {name!r}" if name else "several algorithms" if classes else "no algorithm"
         what += "" if classes else ", a subclass of offbench.algorithm.Algorithm"
         hint = f"; name one: {text}:{' or :'.join(classes)}" if classes else ""
         raise OffbenchError(f"{text} has {what}{hint}")
-    return next(iter(classes.values()))
+    config = vars(module).get("Config")
+    if isinstance(config, type) and config.__module__ == module.__name__:
+        used = any(issubclass(getattr(cls, "Config", object), config) for cls in classes.values())
+        bases = ", ".join(base.__name__ for base in classes[name].__bases__)
+        if not used:
+            raise OffbenchError(
+                f"{text}: {name} does not use the file's Config; write class {name}({bases}, Algorithm[Config]), or "
+                "rename that Config"
+            )
+    return classes[name]
 
 
 def _check_algorithm(cls: type, what: str) -> type[Algorithm]:
@@ -242,6 +253,11 @@ def _check_algorithm(cls: type, what: str) -> type[Algorithm]:
             raise OffbenchError(f"{what}: the setting {field.name} has the name of an option of training; rename it")
         if field.init and field.default is field.default_factory is dataclasses.MISSING:
             raise OffbenchError(f"{what}: the setting {field.name} needs a default")
+    check_declarations(config, what)
+    hints, declared = typing.get_type_hints(config), fields(config)
+    for name, kind in REQUIRED_SETTINGS.items():
+        if hints[name] is not kind or declared[name].metadata.get("per_run"):
+            raise OffbenchError(f"{what}: the setting {name} must be declared as {kind.__name__}, and not per_run")
     if config.__hash__ is None:
         raise OffbenchError(f"{what}: Config must be frozen: @dataclass(frozen=True)")
     return cls

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from offbench.algorithm.interface import Algorithm, PolicyParts, stack_configs
+from offbench.algorithm.interface import Algorithm, PolicyParts, check_noise_spec, stack_configs
+from offbench.algorithm.networks import Network
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
 from offbench.common.settings import short_repr
@@ -17,6 +20,8 @@ from offbench.rollouts.policy import Policy, check_networks
 from offbench.training.batches import CHUNK, Store, draw_chunk
 from offbench.training.captured_update import Program
 from offbench.training.spec import RunSpec, settings_json
+
+Layers = Sequence[tuple[Tensor, Tensor]]
 
 
 class Stack:
@@ -37,7 +42,13 @@ class Stack:
         if len(dims) != 1:
             raise OffbenchError(f"datasets of one stack must have the same shapes, not {sorted(dims)}")
         observation_dim, action_dim = dims.pop()
+        before = _random_states()
         self.algorithm = algorithm_class(config, observation_dim, action_dim, self.seeds, self.device)
+        if _random_states() != before:
+            raise OffbenchError(
+                f"{algorithm_class.__name__}.setup draws random numbers that do not depend on a run's seed alone; use "
+                "self.network and self.parameters, or generators seeded by self.run_seeds"
+            )
         _check_policy(self.algorithm, observation_dim, action_dim)
         if not self.algorithm.learned:
             raise OffbenchError(
@@ -46,6 +57,8 @@ class Stack:
         self.batch_size: int = config.batch_size
         self.store = Store(specs, datasets, config.normalize, self.device, self.algorithm.uses_next_actions)
         self.noise_spec = self.algorithm.noise_spec(self.algorithm.config)
+        check_noise_spec(self.noise_spec, f"{algorithm_class.__name__}.noise_spec")
+        _check_phase(self.algorithm)
         self.program = Program(self.algorithm, self.store)
         self.step = 0
 
@@ -130,6 +143,20 @@ class Stack:
         return names
 
 
+def _random_states() -> tuple[object, ...]:
+    """Return the states of the generators that are shared by all code."""
+    return torch.get_rng_state().numpy().tobytes(), random.getstate(), repr(np.random.get_state())
+
+
+def _check_phase(algorithm: Algorithm) -> None:
+    phase = algorithm.phase(0)
+    try:
+        hash(phase)
+    except TypeError:
+        name = type(algorithm).__name__
+        raise OffbenchError(f"{name}.phase must return a number, text or tuple, not {phase!r:.60}") from None
+
+
 def _check_policy(algorithm: Algorithm, observation_dim: int, action_dim: int) -> None:
     """Raise OffbenchError now, not at the first evaluation, if no policy file can hold the algorithm's policies."""
     where, parts = f"{type(algorithm).__name__}.policy", algorithm.policy(0)
@@ -140,8 +167,24 @@ def _check_policy(algorithm: Algorithm, observation_dim: int, action_dim: int) -
         ready = not any(x.requires_grad or x.is_cuda for layer in [*parts.layers, *parts.critic] for x in layer)
     except (ValueError, TypeError, AttributeError) as error:  # the last two: layers that are not pairs of tensors
         raise OffbenchError(f"{where}: {error}") from None
+    for name, network in vars(algorithm).items():
+        if isinstance(network, Network) and network.norm == "none" and network.activation != parts.activation:
+            for layers in (parts.layers, parts.critic):
+                if _equal(layers, network.layers(0)):
+                    raise OffbenchError(
+                        f"{where}: the layers of {name} have the activation {network.activation}, the policy "
+                        f"{parts.activation}; give PolicyParts(..., activation={network.activation!r})"
+                    )
     if not ready:
         raise OffbenchError(f"{where}: layers must be detached and on the CPU, as `Network.layers` returns them")
+
+
+def _equal(layers: Layers, others: Layers) -> bool:
+    return len(layers) == len(others) and all(
+        a.shape == b.shape and torch.equal(a, b)
+        for one, other in zip(layers, others, strict=True)
+        for a, b in zip(one, other, strict=True)
+    )
 
 
 def slice_of(tensors: Mapping[str, Tensor], run: int) -> dict[str, Tensor]:

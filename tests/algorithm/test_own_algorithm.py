@@ -7,13 +7,13 @@ import inspect
 import itertools
 import types
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
 
 import offbench
-from offbench.algorithm import Algorithm, Network, PolicyParts
+from offbench.algorithm import Algorithm, Network, PolicyParts, normal, setting
 from offbench.algorithm.interface import Distribution
 from offbench.common.errors import OffbenchError
 from offbench.training import registry
@@ -38,11 +38,24 @@ def with_setting(field: Any) -> type:
 COUNT = itertools.count()
 
 
-def elsewhere(self: Any, run: int) -> PolicyParts:
+def elsewhere(self: Any, run: int = 0) -> PolicyParts:
     """A policy whose network is not kept."""
     return PolicyParts(
         "tanh", Network(self.observation_dim, (8,), self.action_dim, [0], 0, learning_rate=1.0).layers(0)
     )
+
+
+def relu(self: Any, run: int = 0) -> PolicyParts:
+    """The policy of `actor`, whose activation is forgotten."""
+    return PolicyParts("tanh", self.actor.layers(run))
+
+
+def penalty(self: Any) -> None:
+    """A gradient of a gradient."""
+    actions = torch.zeros(2, 8, 1, requires_grad=True)
+    q = self.critic(torch.zeros(2, 8, 4), actions)
+    (gradient,) = torch.autograd.grad(q.sum(), actions, create_graph=True)
+    self.critic.minimize(gradient.square().sum((1, 2)))
 
 
 OWN: dict[str, tuple[type, str]] = {
@@ -110,6 +123,68 @@ OWN: dict[str, tuple[type, str]] = {
         with_setting(("need", int)),
         "the setting need needs a default",
     ),
+    "a loss over all runs": (
+        own(update=lambda self: self.critic.minimize(self.critic.flat.square().mean())),
+        "a loss is one number for each run, [runs] = [2], not []: reduce the other axes",
+    ),
+    "forgotten actions": (
+        own(update=lambda self: self.critic(torch.zeros(2, 8, 4))),
+        "a network of 2 runs takes inputs [runs, batch, dim] of 5 dimensions in all, not [2, 8, 4]",
+    ),
+    "inputs of one run": (
+        own(update=lambda self: self.actor(torch.zeros(1, 8, 4))),
+        "a network of 2 runs takes inputs [runs, batch, dim] of 4 dimensions in all, not [1, 8, 4]",
+    ),
+    "a gradient penalty": (own(update=penalty), "needs a network made with twice_differentiable=True"),
+    "a log of steps": (
+        own(update=lambda self: {"step": torch.zeros(2)}),
+        "AWAC.update: 'step' is the column of steps in losses.csv; give that log another name",
+    ),
+    "noise of a wrong shape": (
+        own(noise_spec=lambda self: {"x": normal(0.5, 3)}),
+        "AWAC.noise_spec must return a dict of normal(*shape) and uniform(*shape), with shapes of whole numbers",
+    ),
+    "noise of no distribution": (own(noise_spec=lambda self: {"x": (32, 3)}), "AWAC.noise_spec must return a dict of"),
+    "a list as phase": (
+        own(phase=lambda self: [1]),
+        "AWAC.phase must return a number, text or tuple, not [1]",
+    ),
+    "random numbers in setup": (
+        own(setup=lambda self: setattr(self, "actor", torch.nn.Linear(4, 1)), policy=elsewhere),
+        "AWAC.setup draws random numbers that do not depend on a run's seed alone",
+    ),
+    "another activation": (
+        own(setup=lambda self: setattr(self, "actor", self.actor_network(1, 0.1, activation="tanh")), policy=relu),
+        "the layers of actor have the activation tanh, the policy relu",
+    ),
+    "a learning rate for each run": (
+        own(setup=lambda self: setattr(self, "actor", self.actor_network(1, self.config.alpha))),
+        "a learning rate is a number or a schedule; its setting cannot be per_run",
+    ),
+    "a batch_size that is no whole number": (
+        with_setting(("batch_size", float, 8.0)),
+        "the setting batch_size must be declared as int, and not per_run",
+    ),
+    "a type that settings cannot have": (
+        with_setting(("kind", Literal["a", "b"], "a")),
+        "settings are int, float, bool, str, None, tuple[int, ...] and unions of these",
+    ),
+    "lists for each run": (
+        with_setting(("widths", tuple[int, ...], setting((8,), "widths", per_run=True))),
+        "the setting widths is per_run, so it must be a number, or a word of its choices=",
+    ),
+    "words for each run": (
+        with_setting(("kind", str, setting("a", "kind", per_run=True))),
+        "the setting kind is per_run, so it must be a number, or a word of its choices=",
+    ),
+    "a default out of range": (
+        with_setting(("rate", float, setting(3.0, "rate", high=1))),
+        "a default: rate must be at most 1, not 3",
+    ),
+    "a default of another type": (
+        with_setting(("rate", float, setting("3e-4", "rate"))),
+        "a default: rate must be a number, not '3e-4'",
+    ),
     "no parts": (own(policy=lambda self: self.actor.layers(0)), "AWAC.policy must return PolicyParts, not a list"),
 }
 
@@ -124,6 +199,25 @@ def test_mistakes_in_ones_own_algorithm_are_said_before_they_cost_time(
     words = ["--seeds", "0,1", "--steps", "10", "--hidden", "8", "--batch-size", "8", "--workers", "1"]
     assert message in refusal(["train", "awac", "--dataset", medium, *words], capsys)
     assert not list(home.rglob("checkpoint-*"))
+
+
+def test_a_config_that_no_class_of_a_file_uses_is_refused(home: Path) -> None:
+    text = """from dataclasses import dataclass
+from offbench.algorithm import Algorithm, setting
+from offbench.algos import td3_bc
+
+@dataclass(frozen=True)
+class Config(td3_bc.Config):
+    dropout: float = setting(0.1, "share", low=0, high=1)
+
+class Mine(td3_bc.TD3BC"""
+    (home / "forgotten.py").write_text(f"{text}): ...\n")
+    with pytest.raises(OffbenchError, match=r"write class Mine\(TD3BC, Algorithm\[Config\]\), or rename"):
+        registry.register("./forgotten.py:Mine")
+    (home / "used.py").write_text(f"{text}, Algorithm[Config]): ...\n\nclass Plain(td3_bc.TD3BC): ...\n")
+    settings = dataclasses.fields(load_algorithm(registry.register("./used.py:Mine")).Config)
+    assert "dropout" in {field.name for field in settings}
+    registry.register("./used.py:Plain")
 
 
 def test_two_algorithms_of_one_name_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
