@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import typing
 from collections.abc import Hashable, Iterator, Mapping, Sequence
+from numbers import Integral
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple, Protocol, Unpack
 
@@ -258,17 +259,14 @@ def check_logs(logs: object, runs: int, where: str) -> None:
 
 
 def check_noise_spec(spec: object, where: str) -> None:
-    """Raise OffbenchError unless a noise_spec has names and distributions whose shapes are whole numbers."""
-    items = spec.items() if isinstance(spec, Mapping) else [("", None)]
-    for name, distribution in items:
-        shape = distribution.shape if isinstance(distribution, Distribution) else ("",)
-        if not isinstance(name, str) or not all(isinstance(n, int) and n > 0 for n in shape):
-            raise OffbenchError(
-                f"{where} must return a dict of normal(*shape) and uniform(*shape), with shapes of whole numbers from "
-                f"1, not {name}: {distribution}"
-                if name
-                else f"{where} must return a dict, not {spec!r:.60}"
-            )
+    """Raise OffbenchError unless a noise_spec has a distribution, with a shape of whole numbers, for each name."""
+    if not isinstance(spec, Mapping):
+        raise OffbenchError(f"{where} must return a dict, not a {type(spec).__name__}")
+    for name, distribution in spec.items():
+        shape = distribution.shape if isinstance(distribution, Distribution) else (None,)
+        if not all(isinstance(size, Integral) for size in shape):
+            wanted = "normal(*shape) or uniform(*shape) of whole numbers"
+            raise OffbenchError(f"{where}: {name!r} must be {wanted}, not {distribution!r:.80}")
 
 
 class _NumbersOrWords(NamedTuple):

@@ -77,7 +77,7 @@ def imported_files(file: Path, root: Path, seen: dict[Path, None]) -> dict[Path,
     """Return a file and the files below `root` that it imports, and those that these import.
 
     Args:
-        root: the folder of the algorithm's file, from which Python imports.
+        root: the folder of the first file, from which Python imports.
     """
     if file in seen or not file.is_file():
         return seen
@@ -106,6 +106,7 @@ def _text(file: Path) -> str:
 
 
 def file_hash(file: Path) -> str:
+    """Return the hash of a file's source, or of its bytes if they are no Python of this version."""
     try:
         return source_hash(_text(file))
     except (SyntaxError, UnicodeDecodeError):  # such as a template in a package, which is never imported
@@ -113,6 +114,7 @@ def file_hash(file: Path) -> str:
 
 
 def source_hash(text: str) -> str:
+    """Return the hash of source text."""
     return sha256("\n".join(_tokens(text)).encode())
 
 

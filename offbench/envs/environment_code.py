@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from offbench.common.code_hash import module_code
+from offbench.common.code_hash import module_code, package_versions
 from offbench.common.files import sha256
 
 LEFT_OUT = ("gymnasium", "offbench", "builtins", "abc", "typing")  # a version is recorded of these, or Python has them
@@ -38,6 +38,9 @@ def _code(factory: type | Callable[..., object]) -> dict[str, str]:
     classes = factory.__mro__ if isinstance(factory, type) else (factory,)
     hashes: dict[str, str] = {}
     for module in {cls.__module__ for cls in classes}:
-        if module.partition(".")[0] not in LEFT_OUT and getattr(sys.modules[module], "__file__", None):
-            hashes |= module_code(module)
+        package, file = module.partition(".")[0], getattr(sys.modules[module], "__file__", None)
+        if file is None or package in LEFT_OUT:
+            continue
+        installed = {"site-packages", "dist-packages"} & set(Path(file).parts)  # its version identifies it
+        hashes |= (installed and package_versions(package)) or module_code(module)
     return hashes

@@ -142,9 +142,12 @@ OWN: dict[str, tuple[type, str]] = {
     ),
     "noise of a wrong shape": (
         own(noise_spec=lambda self: {"x": normal(0.5, 3)}),
-        "AWAC.noise_spec must return a dict of normal(*shape) and uniform(*shape), with shapes of whole numbers",
+        "AWAC.noise_spec: 'x' must be normal(*shape) or uniform(*shape) of whole numbers, not Distribution",
     ),
-    "noise of no distribution": (own(noise_spec=lambda self: {"x": (32, 3)}), "AWAC.noise_spec must return a dict of"),
+    "noise of no distribution": (
+        own(noise_spec=lambda self: {"x": (32, 3)}),
+        "AWAC.noise_spec: 'x' must be normal(*shape)",
+    ),
     "a list as phase": (
         own(phase=lambda self: [1]),
         "AWAC.phase must return a number, text or tuple, not [1]",
