@@ -39,7 +39,9 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--steps", type=positive_int, help="transitions (default: the whole level, usually 1,000,000)")
     parser.add_argument("--seed", type=non_negative_int, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--workers", type=positive_int, help="recording processes (default: one per core)")
-    parser.add_argument("--id", dest="dataset_id", metavar="ID", help="the dataset's id (default: <env>-<level>-v0)")
+    parser.add_argument(
+        "--id", dest="dataset_id", metavar="ID", help="the dataset's id (default: <env>-<level>-v<version>)"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset with the same id")
     parser.add_argument(
         "--retrain", action="store_true", help="train a behaviour agent instead of using the shipped one"

@@ -125,7 +125,10 @@ def compare_arguments(parser: Parser, _: list[str]) -> None:
 def evaluate_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `evaluate`."""
     parser.add_argument("paths", nargs="+", metavar="RUN_OR_POLICY", help="run directories or policy files")
-    complete_with(parser.add_argument("--env", help="environment to use instead of the policy's own"), recipes)
+    complete_with(
+        parser.add_argument("--env", help="shipped environment or recipe file to use instead of the policy's own"),
+        recipes,
+    )
     parser.add_argument("--episodes", type=positive_int, help="number of episodes (default: 10)")
     parser.add_argument(
         "--seed",
@@ -190,7 +193,10 @@ def video_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `video`."""
     parser.add_argument("path", metavar="RUN_OR_POLICY", help="a run, a policy file, or ENV:LEVEL (hopper:medium)")
     parser.add_argument("--out", default="video.gif", metavar="FILE", help=".gif or .mp4 (default: video.gif)")
-    complete_with(parser.add_argument("--env", help="environment to use instead of the policy's own"), recipes)
+    complete_with(
+        parser.add_argument("--env", help="shipped environment or recipe file to use instead of the policy's own"),
+        recipes,
+    )
     parser.add_argument("--episodes", type=positive_int, default=1, help="number of episodes (default: 1)")
     parser.add_argument("--seconds", type=number, help="maximum duration (default: whole episodes)")
     parser.add_argument("--seed", type=non_negative_int, default=0, help="seed of the episodes (default: 0)")

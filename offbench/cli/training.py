@@ -176,7 +176,7 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
         from offbench.benchmarks.plan import Plan, prepare
 
         if address and executor != "ray":
-            raise OffbenchError("--address is of a Ray cluster: give --executor ray, too, or leave it out")
+            raise OffbenchError("--address needs --executor ray")
         if plan:
             print_lines(Plan(prepare(**arguments), shard))
             return

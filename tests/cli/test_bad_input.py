@@ -56,7 +56,7 @@ CASES: dict[str, tuple[str, str]] = {
     "evaluate x --similarity --episodes 5": ("--episodes has no effect with --similarity", ""),
     "evaluate x --tolerance 0": ("--tolerance has no effect without --similarity", ""),
     "video hopper:medium --env walker2d": ("hopper:medium names its environment already", "--env"),
-    "benchmark smoke --plan --address auto": ("--address is of a Ray cluster", "--executor ray"),
+    "benchmark smoke --plan --address auto": ("--address needs", "--executor ray"),
     "train bdb --dataset MEDIUM --beta 2": ("bdb: beta must be at most 1, not 2", ""),
     "train bdb --dataset MEDIUM --beta adaptve": ("beta must be a number or adaptive, not 'adaptve'", ""),
     "train bdb --dataset MEDIUM --alpha nan": ("alpha must be a finite number", ""),

@@ -268,6 +268,7 @@ def test_full_shared_memory_is_one_line() -> None:
     if not shutil.which("unshare") or subprocess.run([*own, full], capture_output=True, check=False).returncode:
         pytest.skip("needs the right to mount a small tmpfs at /dev/shm")
     words = ["-m", "offbench", "collect", "inverted-pendulum", "--level", "random", "--steps", "300"]
+    words += ["--workers", "2"]
     command = [*own, f'{full}; exec "$0" "$@"', sys.executable, *words]
     found = subprocess.run(command, capture_output=True, text=True, check=False)
     assert found.returncode == 2
