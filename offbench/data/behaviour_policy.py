@@ -63,15 +63,15 @@ def read_behaviour_policy(source: str, low: Array, high: Array, observation_dim:
         )
     if not (np.allclose(policy.low, low) and np.allclose(policy.high, high)):
         raise OffbenchError(f"{source} acts in {policy.low} to {policy.high}, but {env_id} in {low} to {high}")
-    if _task(policy.env_id) != _task(env_id):
+    if policy.env_id and _task(policy.env_id) != _task(env_id):
         warn(f"{source} was trained for {policy.env_id}, and is recorded in {env_id}")
     algorithm = str(policy.origin.get("algorithm", "unknown"))
     return BehaviourPolicy(policy, path.name or source, algorithm, sha256(policy.to_bytes()))
 
 
 def _task(env_id: str) -> str:
-    """Return an environment's id without its version."""
-    return re.sub(r"-v\d+$", "", env_id)
+    """Return an environment's id without the module that registers it and without its version."""
+    return re.sub(r"-v\d+$", "", env_id.rpartition(":")[2])
 
 
 def level_name(name: str | None, source: str) -> str:
