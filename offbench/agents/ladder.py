@@ -139,6 +139,11 @@ class Ladder:
                 f"the ladder in {self.folder} is of {old}, the recipe is of {new}; delete that folder, or rename "
                 "the recipe"
             )
+        if changed := changes(self.info.env_code, environment_code(recipe.env_spec())):
+            raise OffbenchError(
+                f"the behaviour agent in {self.folder.parent} was trained in other code of its environment: {changed}"
+                "; delete that folder to train it again"
+            )
         return self
 
     @property
@@ -195,11 +200,6 @@ def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool =
     if ladder is None:
         return None
     ladder.check(recipe)
-    if changed := changes(ladder.info.env_code, environment_code(recipe.env_spec())):
-        raise OffbenchError(
-            f"the behaviour agent in {ladder.folder.parent} was trained in other code of its environment: {changed}; "
-            "delete that folder to train it again"
-        )
     if not shipped:
         inform(f"using the behaviour agent trained here: {ladder.folder}")
         _warn_other_recipe(ladder, recipe)

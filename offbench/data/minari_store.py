@@ -282,8 +282,10 @@ def _check_nesting(dataset_id: str, path: Path) -> None:
     metadata = Path("data", "metadata.json")
     above = [folder for folder in path.parents if folder.is_relative_to(root()) and (folder / metadata).is_file()]
     below = [file.parents[1] for file in path.rglob(str(metadata)) if file != path / metadata]
-    for other in (*above, *below):
-        raise OffbenchError(f"{dataset_id} would share a folder with {other.relative_to(root())}; choose another id")
+    if others := [*above, *below]:
+        raise OffbenchError(
+            f"{dataset_id} would share a folder with {others[0].relative_to(root())}; choose another id"
+        )
 
 
 def _size(dataset_id: str) -> str:

@@ -16,10 +16,11 @@ import numpy as np
 import torch
 
 from offbench.common import checkpoints
+from offbench.common.code_hash import changes
 from offbench.common.errors import OffbenchError
 from offbench.common.provenance import training_platform
 from offbench.common.settings import fields
-from offbench.common.terminal import inform
+from offbench.common.terminal import inform, warn
 from offbench.data import transitions
 from offbench.data.minari_store import provenance
 from offbench.data.recorded_env import report_margin_rule
@@ -61,9 +62,12 @@ def check_datasets(datasets: Datasets) -> None:
     for name, data in datasets.items():
         if data.env_spec:
             checked_spec(data.env_spec, name, data.observations.shape[1], data.low, data.high)
+            recorded = provenance(data.metadata)
             if data.evaluated_in is None:
                 report_margin_rule(name, data.metadata, data.env_spec)
-            warn_other_physics(name, provenance(data.metadata).versions, data.env_spec)
+                if changed := changes(recorded.env_code, environment_code(data.env_spec)):
+                    warn(f"{name} was recorded in other code of its environment: {changed}; scores may not compare")
+            warn_other_physics(name, recorded.versions, data.env_spec)
         else:
             inform(
                 f"{name} names no environment, so nothing is evaluated during training; "

@@ -35,7 +35,7 @@ class ReplayResult:
     steps: int
     faults: tuple[tuple[str, str], ...] = ()
     end: bool = True  # whether its last step was played, so that its end is checked
-    rounding: bool = False  # whether it differs from its seed on, first in the last bits alone
+    rounding: bool = False  # whether a replay from the seed differs, at first in the last bits only
 
 
 def replay_episode(spec: str, episode: RecordedEpisode, exact: bool, last_unknown: bool) -> ReplayResult:

@@ -206,8 +206,8 @@ def _add_replays(replays: Sequence[ReplayResult], mujoco: str | None, report: Re
             report.checked.append(f"{counted(len(played), 'episode')} played again {method}: {counted(steps, 'step')}")
     if rounding := sum(replay.rounding for replay in replays):
         report.warnings.append(
-            f"{counted(rounding, 'episode')} played from their seeds differ in the last bits first, and then more and "
-            "more: another processor or C library rounds differently"
+            f"{counted(rounding, 'episode')} played again from their seeds differ, at first in the last bits only: "
+            "the processor or C library that recorded them rounds differently"
         )
     open_ends = sum(replay.how != "none" and not replay.end for replay in replays)
     if open_ends:

@@ -91,6 +91,8 @@ def test_an_edit_is_noticed(home: Path, recipe: Path, capfd: pytest.CaptureFixtu
         offbench.collect(recipe, "expert", workers=1)
     with pytest.raises(OffbenchError, match=r"began in other code of its environment: gains.py has changed"):
         offbench.behaviour(recipe, workers=1)
+    with pytest.raises(OffbenchError, match=r"was trained in other code of its environment: gains.py has changed"):
+        offbench.normalize(env=recipe, returns=[1.0])
     (home / "behaviour").rename(home / "old")
     with pytest.raises(OffbenchError, match=r"pushed-random-v0 was recorded in other code of its env.*: gains.py"):
         offbench.collect(recipe, "random", workers=1)
@@ -100,6 +102,7 @@ def test_an_edit_is_noticed(home: Path, recipe: Path, capfd: pytest.CaptureFixtu
     offbench.evaluate(folder, episodes=1, workers=1)
     assert "environment has changed since it was trained: gains.py" in capfd.readouterr().err
     offbench.train("bc", dataset, steps=2, seeds=[1], **SMALL)
+    assert f"{dataset} was recorded in other code of its environment: gains.py" in capfd.readouterr().err
     with pytest.raises(OffbenchError, match="evaluated in environments of different code"):
         read_results("runs")
 
