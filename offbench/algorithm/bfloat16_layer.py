@@ -21,35 +21,35 @@ class Bfloat16Layer:
     def __init__(self, h: Array, weight: Array, out: Array, keep: bool) -> None:
         self._h, self._weight, self._out = map(torch.from_numpy, (h, weight, out))
         batch, (rows, columns) = len(h), weight.shape
-        self._half_h = (_halves if keep else shared("inputs", _halves))(batch, rows)
-        self._half_weight = (_halves if keep else shared("weights", _halves))(rows, columns)
-        self._half_out = shared("product", _halves)(batch, columns)
+        self._bf16_h = (_bf16_buffer if keep else shared("inputs", _bf16_buffer))(batch, rows)
+        self._bf16_weight = (_bf16_buffer if keep else shared("weights", _bf16_buffer))(rows, columns)
+        self._bf16_out = shared("product", _bf16_buffer)(batch, columns)
         if keep:
-            self._half_gradient = shared("gradient", _halves)(batch, columns)
-            self._half_of_weight = shared("product", _halves)(rows, columns)
-            self._half_of_h = shared("product", _halves)(batch, rows - 1)
+            self._bf16_grad = shared("gradient", _bf16_buffer)(batch, columns)
+            self._bf16_grad_weight = shared("product", _bf16_buffer)(rows, columns)
+            self._bf16_grad_h = shared("product", _bf16_buffer)(batch, rows - 1)
 
     def forward(self) -> None:
         """Compute `out`."""
-        self._half_h.copy_(self._h)
-        self._half_weight.copy_(self._weight)
-        torch.mm(self._half_h, self._half_weight, out=self._half_out)
-        self._out.copy_(self._half_out)
+        self._bf16_h.copy_(self._h)
+        self._bf16_weight.copy_(self._weight)
+        torch.mm(self._bf16_h, self._bf16_weight, out=self._bf16_out)
+        self._out.copy_(self._bf16_out)
 
     def load(self, gradient: Tensor) -> None:
-        """Take the gradient of `out`, [batch, out], of which the other gradients follow."""
-        self._half_gradient.copy_(gradient)
+        """Set the gradient of `out`, [batch, out], from which the other gradients are computed."""
+        self._bf16_grad.copy_(gradient)
 
-    def of_weight(self, out: Tensor) -> None:
+    def grad_weight(self, out: Tensor) -> None:
         """Compute the gradient of `weight`."""
-        torch.mm(self._half_h.T, self._half_gradient, out=self._half_of_weight)
-        out.copy_(self._half_of_weight)
+        torch.mm(self._bf16_h.T, self._bf16_grad, out=self._bf16_grad_weight)
+        out.copy_(self._bf16_grad_weight)
 
-    def of_h(self, out: Tensor) -> None:
+    def grad_h(self, out: Tensor) -> None:
         """Compute the gradient of `h` without its ones, [batch, in]."""
-        torch.mm(self._half_gradient, self._half_weight[:-1].T, out=self._half_of_h)
-        out.copy_(self._half_of_h)
+        torch.mm(self._bf16_grad, self._bf16_weight[:-1].T, out=self._bf16_grad_h)
+        out.copy_(self._bf16_grad_h)
 
 
-def _halves(rows: int, columns: int) -> Tensor:
+def _bf16_buffer(rows: int, columns: int) -> Tensor:
     return torch.empty(rows, columns, dtype=torch.bfloat16)

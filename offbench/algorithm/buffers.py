@@ -1,4 +1,4 @@
-"""Arrays that the passes of networks on a CPU compute in."""
+"""Buffers of the forward and backward passes on a CPU."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from torch import Tensor
 
 Array = npt.NDArray[np.float32]
 Buffer = TypeVar("Buffer", Array, Tensor)
-ALIGNED = 16  # float32 numbers of 64 bytes: rows of buffers begin where a processor's wide registers do
+# float32 numbers of a vector register (64 bytes). Rows of buffers and the parameters of each run begin at multiples of
+# it: vectorized loops round their last elements differently, and a run must be the same alone and in a stack.
+ALIGNED = 16
 
 
 def rows(batch: int, width: int) -> Array:
@@ -33,7 +35,7 @@ _BUFFERS = threading.local()
 
 
 def shared(use: str, make: Callable[[int, int], Buffer]) -> Callable[[int, int], Buffer]:
-    """Return `make` whose arrays all passes of this thread share, for what is used up within one pass."""
+    """Return a version of `make` whose arrays are shared by all passes of this thread, for values of a single pass."""
 
     def make_once(batch: int, width: int) -> Buffer:
         arrays: dict[object, Buffer] = _BUFFERS.__dict__.setdefault("arrays", {})

@@ -43,7 +43,7 @@ class NotCapturableError(Exception):
     """An update does something that a replay would not repeat."""
 
 
-class Recording:
+class Trace:
     """The operations of one update, to be replayed in place.
 
     Attributes:
@@ -65,7 +65,7 @@ class Recording:
         for call in self.calls:
             call()
 
-    def same_as(self, other: Recording) -> bool:
+    def same_as(self, other: Trace) -> bool:
         """Return whether two records do the same with the same numbers."""
         return (
             self.key == other.key
@@ -120,43 +120,43 @@ class Recording:
         )
 
 
-def record(update: Callable[[], object]) -> Recording:
+def trace(update: Callable[[], object]) -> Trace:
     """Do an update, and return what it did.
 
     Raises:
         NotCapturableError: it was done, but cannot be replayed.
     """
-    recording = Recording()
-    mode = _Recorder(recording)
-    _ACTIVE.recording = recording
+    trace = Trace()
+    mode = _Tracer(trace)
+    _ACTIVE.trace = trace
     try:
         with mode:
             update()
     finally:
-        _ACTIVE.recording = None
+        _ACTIVE.trace = None
     if mode.problem:
         raise NotCapturableError(mode.problem)
-    recording.finish()
-    return recording
+    trace.finish()
+    return trace
 
 
 @contextmanager
-def one_call() -> Iterator[Recording | None]:
-    """Record what is done within as one call, which the caller adds to the recording; yield None if there is none."""
-    recording: Recording | None = getattr(_ACTIVE, "recording", None)
-    if recording is None:
+def one_call() -> Iterator[Trace | None]:
+    """Record what is done within as one call, which the caller adds to the trace; yield None if there is none."""
+    trace: Trace | None = getattr(_ACTIVE, "trace", None)
+    if trace is None:
         yield None
     else:
         with _disable_current_modes():
-            yield recording
+            yield trace
 
 
-class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Does each operation and adds it to a recording."""
+class _Tracer(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Does each operation and adds it to a trace."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, trace: Trace) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.recording, self.problem = recording, ""
+        self.trace, self.problem = trace, ""
 
     def __torch_dispatch__(
         self, func: OpOverload, types: object, args: Args = (), kwargs: Kwargs | None = None
@@ -169,14 +169,14 @@ class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
                 what = f"draws random numbers by {func}, which a resumed run would not repeat; use noise_spec"
             self.problem = self.problem or f"it {what}"
         elif func._schema.is_mutable:
-            self.recording.changed((args, kwargs))
-            self.recording.add(func, (args, kwargs), (), _single(func, args, kwargs))
+            self.trace.changed((args, kwargs))
+            self.trace.add(func, (args, kwargs), (), _single(func, args, kwargs))
         elif _is_view(result, (args, kwargs)) or func.overloadpacket.__name__.startswith("empty"):
-            self.recording.keep(result)
+            self.trace.keep(result)
         else:
             call = _in_place(func, args, kwargs, result)
             constant = func.overloadpacket.__name__ in _CONSTANTS
-            self.recording.add(func, (args, kwargs), result, call, constant=constant)
+            self.trace.add(func, (args, kwargs), result, call, constant=constant)
         return result
 
 

@@ -2,7 +2,7 @@
 
     Config                      frozen dataclass of `setting`s: CLI flags, help, config.json; the training itself
                                 reads batch_size, normalize and, if there is one, top (share of best episodes)
-    setup(c)                    makes the networks; every one that is an attribute is part of a checkpoint
+    setup(c)                    creates the networks; every one that is an attribute is part of a checkpoint
     noise_spec(c)               the random numbers of one update, by name
     phase(step)                 the kind of update at a step
     update(batch, noise, phase) one update, in place; returns {name: [runs]}, the columns of losses.csv
@@ -84,8 +84,9 @@ class PolicyParts(NamedTuple):
     """A policy file's kind (see offbench/rollouts/policy.py) and weights, each layer (weight [in, out], bias [out]).
 
     Attributes:
-        activation: between the layers, `relu` or `tanh`.
-        critic, samples: only for the kind `best_by_q`: Q of (observation, action), and how many to choose from.
+        activation: activation between the layers, `relu` or `tanh`.
+        critic, samples: only for the kind `best_by_q`: Q of (observation, action), and the number of actions to choose
+            from.
     """
 
     kind: str
@@ -137,11 +138,11 @@ class Algorithm(Generic[C]):
         self.config = config
         self.observation_dim, self.action_dim = observation_dim, action_dim
         self.run_seeds, self.device = tuple(run_seeds), torch.device(device)
-        self._networks = 0  # made so far: the index of the next, which its initial weights depend on
+        self._networks = 0  # number of networks so far: the index of the next one, which its weights depend on
         self.setup(config)
 
     def setup(self, c: C) -> None:
-        """Make the networks, as attributes. The order of creation is part of what a seed means."""
+        """Create the networks, as attributes. Their initial weights depend on the order of creation."""
         raise NotImplementedError(f"{type(self).__name__} has no setup(c)")
 
     def noise_spec(self, c: C) -> NoiseSpec:
@@ -153,7 +154,7 @@ class Algorithm(Generic[C]):
         return None
 
     def update(self, batch: Batch, noise: Noise, phase: Any) -> Logs:
-        """Do one update of every run; return what is logged, the same names for a phase."""
+        """Perform one update of every run; return what is logged, always the same names in a phase."""
         raise NotImplementedError(f"{type(self).__name__} has no update(batch, noise, phase)")
 
     def policy(self, run: int) -> PolicyParts:
@@ -192,8 +193,8 @@ class Algorithm(Generic[C]):
         """Return a network for each run.
 
         Args:
-            outputs: None for one number, whose axis is left out.
-            ensemble_size: networks for each run; None for one, whose axis is left out.
+            outputs: width of the outputs; None for a single number without an axis of its own.
+            ensemble_size: networks for each run; None for a single one without an ensemble axis.
             options: see `Network`; `hidden` is the setting of that name by default.
         """
         index, self._networks = self._networks, self._networks + 1

@@ -1,12 +1,12 @@
-"""The forward and backward pass of many equal perceptrons.
+"""The forward and backward pass of many MLPs of the same shape.
 
     flat [ensemble, runs, P] = W0 [in, h] | b0 [h] | W1 [h, h] | b1 [h] | ... | 0
     inputs [runs, batch, dim], concatenated to x [runs, batch, in]   ->   outputs [ensemble, runs, batch, out]
 
-On a GPU a layer of all perceptrons is one batched product, and autograd computes the gradients (`stacked`).
+On a GPU, one batched matrix product computes a layer of all MLPs, and autograd the gradients (`batched_forward`).
 
-On a CPU perceptrons are computed one after the other, so that their arrays stay in the cache, and the passes are
-written out (`Pass`): buffers are kept between calls, NumPy (OpenBLAS) writes products into them, and unused gradients
+On a CPU, the MLPs are computed one after the other, so that their arrays stay in the cache, and the passes are written
+out (`ForwardPass`): buffers are kept between calls, NumPy (OpenBLAS) writes products into them, and unused gradients
 are not computed. A layer's weights and bias are adjacent in memory, so they are one matrix, and the inputs of each
 layer have a last column of ones:
 
@@ -32,69 +32,70 @@ from torch import Tensor
 from offbench.algorithm.bfloat16_layer import Bfloat16Layer
 from offbench.algorithm.buffers import Array, rows, rows_with_ones, shared
 from offbench.algorithm.cpu_capture import Call, one_call
-from offbench.algorithm.stacked import layers_of, one_by_one, stacked
+from offbench.algorithm.stacked import batched_forward, layers_of, sequential_forward
 from offbench.common.errors import OffbenchError
 
-_WAY = ContextVar("way", default="numpy")
+_BACKEND = ContextVar("backend", default="numpy")
 NARROW = 64  # a product with fewer inputs or outputs gains nothing from bfloat16 on a CPU
 
 
-def perceptrons(
+def mlp_forward(
     flat: Tensor,
     inputs: Sequence[Tensor],
     sizes: Sequence[int],
     activation: str,
     norm: str = "none",
-    twice: bool = False,
+    twice_differentiable: bool = False,
 ) -> Tensor:
-    """Return the outputs [ensemble, runs, batch, out] of perceptrons with layers of `sizes`.
+    """Return the outputs [ensemble, runs, batch, out] of MLPs with layers of `sizes`.
 
     Args:
-        flat: all weights and biases [ensemble, runs, P]; what lies behind the last bias has no effect.
+        flat: all weights and biases [ensemble, runs, P]; values after the last bias have no effect.
         inputs: each [runs, batch, dim].
-        activation: of the hidden layers, relu or tanh.
+        activation: activation of the hidden layers, relu or tanh.
         norm: LayerNorm of the hidden layers: none, before or after the activation. `flat` then has a gain and a shift
-            behind each hidden layer's bias.
-        twice: whether the outputs must be differentiable twice. The passes written out for a CPU are differentiable
-            once; these networks, and those with LayerNorm, are PyTorch's own operations, which cost more.
+            after each hidden layer's bias.
+        twice_differentiable: whether the outputs must be differentiable twice. The passes written out for a CPU are
+            differentiable once; such networks, and those with LayerNorm, use PyTorch's operations, which are slower.
     """
-    way = _WAY.get()
-    half = way == "bfloat16"
-    if flat.device.type != "cpu" or flat.dtype != torch.float32 or way == "pytorch":
-        return stacked(flat, inputs, sizes, activation, norm, torch.bfloat16 if half else None)
-    if norm != "none" or twice:
-        return one_by_one(flat, inputs, sizes, activation, norm, torch.bfloat16 if half else None)
-    outputs: Tensor = _Perceptrons.apply(flat, tuple(sizes), activation, half, *inputs)  # type: ignore[no-untyped-call]
+    backend = _BACKEND.get()
+    bf16 = backend == "bfloat16"
+    if flat.device.type != "cpu" or flat.dtype != torch.float32 or backend == "pytorch":
+        return batched_forward(flat, inputs, sizes, activation, norm, torch.bfloat16 if bf16 else None)
+    if norm != "none" or twice_differentiable:
+        return sequential_forward(flat, inputs, sizes, activation, norm, torch.bfloat16 if bf16 else None)
+    outputs: Tensor = _MLPs.apply(flat, tuple(sizes), activation, bf16, *inputs)  # type: ignore[no-untyped-call]
     return outputs
 
 
 @contextmanager
-def products_by(way: str) -> Iterator[None]:
-    """Choose how `perceptrons` multiplies.
+def matmul_backend(backend: str) -> Iterator[None]:
+    """Choose what computes the matrix products of `mlp_forward`.
 
     Args:
-        way: `numpy` on a CPU, the default; `pytorch`, whose tools do not see NumPy's products; or `bfloat16`.
+        backend: `numpy` on a CPU, the default; `pytorch`, for tools of PyTorch that do not see NumPy's products; or
+            `bfloat16`.
     """
-    token = _WAY.set(way)
+    token = _BACKEND.set(backend)
     try:
         yield
     finally:
-        _WAY.reset(token)
+        _BACKEND.reset(token)
 
 
-class _Perceptrons(torch.autograd.Function):
+class _MLPs(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, flat: Tensor, sizes: tuple[int, ...], activation: str, half: bool, *inputs: Tensor
+        ctx: Any, flat: Tensor, sizes: tuple[int, ...], activation: str, bf16: bool, *inputs: Tensor
     ) -> Tensor:
         keep = any(ctx.needs_input_grad)
-        with one_call() as recording:
-            ctx.made = made = Pass(flat, inputs, sizes, activation, keep, half)
-            made.run()
-        if recording:
-            recording.add(("forward", sizes, activation, keep, half), (flat, inputs), made.outputs, made.run)
-        ctx.save_for_backward(flat)  # autograd sees if it was changed since
-        return made.outputs
+        with one_call() as trace:
+            ctx.forward_pass = forward = ForwardPass(flat, inputs, sizes, activation, keep, bf16)
+            forward.run()
+        if trace:
+            trace.add(("forward", sizes, activation, keep, bf16), (flat, inputs), forward.outputs, forward.run)
+        ctx.save_for_backward(flat)  # so that autograd raises if it is changed before the backward pass
+        return forward.outputs
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
@@ -102,22 +103,22 @@ class _Perceptrons(torch.autograd.Function):
             raise OffbenchError("a gradient of a gradient needs a network made with twice_differentiable=True")
         (flat,) = ctx.saved_tensors
         needs = ctx.needs_input_grad[0], ctx.needs_input_grad[4:]
-        with one_call() as recording:
-            back = PassBack(ctx.made, flat, grads[0], *needs)
-            back.run()
-        gradients = (back.of_flat, *back.of_inputs)
-        if recording:
-            reads, writes = (ctx.made.outputs, grads[0]), [gradient for gradient in gradients if gradient is not None]
-            recording.add(("backward", needs), reads, writes, back.run)
+        with one_call() as trace:
+            backward = BackwardPass(ctx.forward_pass, flat, grads[0], *needs)
+            backward.run()
+        gradients = (backward.grad_flat, *backward.grad_inputs)
+        if trace:
+            writes = [gradient for gradient in gradients if gradient is not None]
+            trace.add(("backward", needs), (ctx.forward_pass.outputs, grads[0]), writes, backward.run)
         return gradients[0], None, None, None, *gradients[1:]
 
 
-class Pass:
+class ForwardPass:
     """A forward pass on the CPU, with buffers of its own.
 
     Args:
         keep: whether a backward pass may follow, so that the layers' activations must not be overwritten.
-        half: whether wide products are in bfloat16.
+        bf16: whether wide products are in bfloat16.
     """
 
     def __init__(
@@ -127,7 +128,7 @@ class Pass:
         sizes: Sequence[int],
         activation: str,
         keep: bool,
-        half: bool = False,
+        bf16: bool = False,
     ) -> None:
         self.sizes, self.activation = sizes, activation
         self.shape = (flat.shape[0], *inputs[0].shape[:2])  # ensemble, runs, batch
@@ -142,25 +143,25 @@ class Pass:
             for run in range(runs)
         ]
         self.layers = [_array(layer) for layer, _ in layers_of(flat, sizes)]  # each [ensemble, runs, in + 1, out]
-        # what goes into each layer, [batch, in + 1], of each perceptron
-        self.into: dict[tuple[int, int], list[Array]] = {}
-        self.bfloat16_layers: dict[tuple[int, int, int], Bfloat16Layer] = {}  # of each perceptron
+        self.layer_inputs: dict[tuple[int, int], list[Array]] = {}  # by (member, run): each [batch, in + 1]
+        self.bfloat16_layers: dict[tuple[int, int, int], Bfloat16Layer] = {}  # by (member, run, layer)
         outputs = _array(self.outputs)
         for member, run in itertools.product(range(ensemble), range(runs)):
-            h, self.into[member, run] = x[run], [x[run]]
+            h, self.layer_inputs[member, run] = x[run], [x[run]]
             for layer, width in enumerate(sizes[1:-1]):
-                make = rows_with_ones if keep else shared(f"layer {layer}", rows_with_ones)
-                into = make(batch, width)
+                allocate = rows_with_ones if keep else shared(f"layer {layer}", rows_with_ones)
+                layer_output = allocate(batch, width)
                 weight = self.layers[layer][member, run]
-                if half and min(sizes[layer], width) >= NARROW:
-                    product = self.bfloat16_layers[member, run, layer] = Bfloat16Layer(h, weight, into[:, :-1], keep)
-                    self.calls.append(product.forward)
+                if bf16 and min(sizes[layer], width) >= NARROW:
+                    bf16_layer = Bfloat16Layer(h, weight, layer_output[:, :-1], keep)
+                    self.bfloat16_layers[member, run, layer] = bf16_layer
+                    self.calls.append(bf16_layer.forward)
                 else:
-                    self.calls.append(partial(np.matmul, h, weight, into[:, :-1]))
-                hidden = torch.from_numpy(into[:, :-1])
+                    self.calls.append(partial(np.matmul, h, weight, layer_output[:, :-1]))
+                hidden = torch.from_numpy(layer_output[:, :-1])
                 self.calls.append(hidden.relu_ if activation == "relu" else hidden.tanh_)
-                h = into
-                self.into[member, run].append(into)
+                h = layer_output
+                self.layer_inputs[member, run].append(layer_output)
             self.calls.append(partial(np.matmul, h, self.layers[-1][member, run], outputs[member, run]))
 
     def run(self) -> None:
@@ -169,23 +170,23 @@ class Pass:
             call()
 
 
-class PassBack:
+class BackwardPass:
     """The backward pass of a forward pass.
 
     Attributes:
-        of_flat, of_inputs: the gradients; None where not needed.
+        grad_flat, grad_inputs: the gradients; None where not needed.
     """
 
     def __init__(
-        self, forward: Pass, flat: Tensor, grad: Tensor, needs_flat: bool, needs_inputs: Sequence[bool]
+        self, forward: ForwardPass, flat: Tensor, grad: Tensor, needs_flat: bool, needs_inputs: Sequence[bool]
     ) -> None:
         ensemble, runs, batch = forward.shape
         sizes, widths = forward.sizes, forward.widths
-        self.of_flat = torch.zeros_like(flat) if needs_flat else None
-        of_layers = None
-        if self.of_flat is not None:
-            of_layers = [_array(layer) for layer, _ in layers_of(self.of_flat, sizes)]
-        self.of_inputs = [
+        self.grad_flat = torch.zeros_like(flat) if needs_flat else None
+        grad_layers = None
+        if self.grad_flat is not None:
+            grad_layers = [_array(layer) for layer, _ in layers_of(self.grad_flat, sizes)]
+        self.grad_inputs = [
             torch.empty(runs, batch, width) if needed else None
             for width, needed in zip(widths, needs_inputs, strict=True)
         ]
@@ -197,35 +198,35 @@ class PassBack:
         for member, run in itertools.product(range(ensemble), range(runs)):
             g = last[member, run]
             for layer in reversed(range(len(sizes) - 1)):
-                h, weight = forward.into[member, run][layer], forward.layers[layer][member, run][:-1]
-                half = forward.bfloat16_layers.get((member, run, layer))
-                if half is not None:
-                    self.calls.append(partial(half.load, torch.from_numpy(g)))
-                if of_layers is not None:
-                    of_layer = of_layers[layer][member, run]
-                    if half is None:
-                        self.calls.append(partial(np.matmul, h.T, g, of_layer))
+                h, weight = forward.layer_inputs[member, run][layer], forward.layers[layer][member, run][:-1]
+                bf16_layer = forward.bfloat16_layers.get((member, run, layer))
+                if bf16_layer is not None:
+                    self.calls.append(partial(bf16_layer.load, torch.from_numpy(g)))
+                if grad_layers is not None:
+                    grad_layer = grad_layers[layer][member, run]
+                    if bf16_layer is None:
+                        self.calls.append(partial(np.matmul, h.T, g, grad_layer))
                     else:
-                        self.calls.append(partial(half.of_weight, torch.from_numpy(of_layer)))
+                        self.calls.append(partial(bf16_layer.grad_weight, torch.from_numpy(grad_layer)))
                 if layer:
                     before = shared(f"gradient {layer % 2}", rows)(batch, sizes[layer])
-                    if half is None:
+                    if bf16_layer is None:
                         self._product(g, weight.T, before)
                     else:
-                        self.calls.append(partial(half.of_h, torch.from_numpy(before)))
-                    self.calls.append(_through(forward.activation, before, h[:, :-1]))
+                        self.calls.append(partial(bf16_layer.grad_h, torch.from_numpy(before)))
+                    self.calls.append(_activation_backward(forward.activation, before, h[:, :-1]))
                     g = before
                     continue
                 start = 0
-                for width, gradient in zip(widths, self.of_inputs, strict=True):
+                for width, gradient in zip(widths, self.grad_inputs, strict=True):
                     if gradient is not None:
-                        part, of_input = weight[start : start + width].T, _array(gradient)[run]
+                        part, grad_input = weight[start : start + width].T, _array(gradient)[run]
                         if member == 0:
-                            self._product(g, part, of_input)
+                            self._product(g, part, grad_input)
                         else:
                             other = shared("gradient of an input", rows)(batch, width)
                             self._product(g, part, other)
-                            self.calls.append(partial(np.add, of_input, other, of_input))
+                            self.calls.append(partial(np.add, grad_input, other, grad_input))
                     start += width
 
     def _product(self, a: Array, b: Array, out: Array) -> None:
@@ -236,12 +237,12 @@ class PassBack:
             self.calls.append(partial(np.matmul, a, b, out))
 
     def run(self) -> None:
-        """Compute `of_flat` and `of_inputs`."""
+        """Compute `grad_flat` and `grad_inputs`."""
         for call in self.calls:
             call()
 
 
-def _through(activation: str, gradient: Array, h: Array) -> Call:
+def _activation_backward(activation: str, gradient: Array, h: Array) -> Call:
     """Return the call that turns the gradient of an activation's output h into that of its input, in place."""
     g, output = torch.from_numpy(gradient), torch.from_numpy(h)
     if activation == "relu":

@@ -1,4 +1,4 @@
-"""Stacked networks: every parameter of one network of all runs lies in one flat tensor.
+"""Stacked networks: one flat tensor holds a network's parameters for all runs.
 
     flat [ensemble, runs, P]        ensemble: 1 actor, or the M critics of a run
       = W0 [.., in, h] | b0 [.., h] | W1 [.., h, h] | b1 [.., h] | ... | 0      (x @ W + b)
@@ -20,14 +20,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torch.optim.adam import adam
 
-from offbench.algorithm.mlp import perceptrons
+from offbench.algorithm.buffers import ALIGNED
+from offbench.algorithm.mlp import mlp_forward
 from offbench.common import seeds
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import Purpose
-
-# The numbers that a run learns are padded to a multiple of this, so that each run is aligned with a processor's vector
-# registers: vectorized loops round their last elements differently, and a run must be the same alone and in a stack.
-ALIGNED = 16
 
 Schedule = Callable[[Tensor], Tensor]  # from the number of earlier steps, a tensor [], to the learning rate
 
@@ -124,16 +121,16 @@ def minimize(loss: Tensor, *parts: Parameters, retain_graph: bool = False) -> No
 
 
 class Network(Parameters):
-    """Multilayer perceptrons of one shape, with PyTorch's default initial weights.
+    """MLPs of the same shape, with PyTorch's default initialization.
 
     Args:
-        inputs: width of the inputs, concatenated.
+        inputs: total width of the inputs, which are concatenated.
         hidden: widths of the hidden layers.
-        outputs: width of the outputs; None for one number, whose axis is left out.
+        outputs: width of the outputs; None for a single number without an axis of its own.
         run_seeds: one seed for each run; a run's weights depend only on its seed and on `index`.
-        index: tells an algorithm's networks apart.
-        ensemble_size: perceptrons for each run; None for one, whose axis is left out.
-        activation: of the hidden layers, relu or tanh.
+        index: the network's number among those of an algorithm.
+        ensemble_size: MLPs for each run; None for a single one without an ensemble axis.
+        activation: activation of the hidden layers, relu or tanh.
         norm: LayerNorm in the hidden layers, before or after the activation.
         twice_differentiable: whether gradients of gradients are needed (a gradient penalty); costs more on a CPU.
     """
@@ -177,16 +174,16 @@ class Network(Parameters):
     def __call__(self, *inputs: Tensor) -> Tensor:
         """Return the outputs for inputs [runs, batch, dim], concatenated.
 
-        They are [ensemble, runs, batch, out]; without the ensemble's axis where there is no ensemble, and without the
-        last axis where the outputs are one number.
+        They are [ensemble, runs, batch, out], without the first axis if there is no ensemble, and without the last if
+        each output is a single number.
         """
         return self.forward(self.flat, *inputs)
 
     def frozen(self, *inputs: Tensor, members: int | slice = slice(None)) -> Tensor:
-        """Like a call, with no gradient to the weights.
+        """Return the outputs as a call does, without gradients of the weights.
 
         Args:
-            members: of the ensemble: one, whose axis is left out, or a slice.
+            members: index of one member (drops the ensemble axis), or a slice.
         """
         if isinstance(members, slice):
             return self.forward(self.flat.detach()[members], *inputs)
@@ -194,7 +191,7 @@ class Network(Parameters):
         return outputs if 0 in self._squeezed else outputs.squeeze(0)
 
     def forward(self, flat: Tensor, *inputs: Tensor) -> Tensor:
-        """Return the outputs of the networks in `flat`, as a call does."""
+        """Return the outputs of networks whose parameters are `flat`."""
         shapes, runs = [list(x.shape) for x in inputs], flat.shape[1]
         fit = all(len(shape) == 3 and shape[:2] == [runs, shapes[0][1]] for shape in shapes)
         if not fit or sum(shape[2] for shape in shapes) != self.sizes[0]:
@@ -202,7 +199,7 @@ class Network(Parameters):
                 f"a network of {runs} runs takes inputs [runs, batch, dim] of {self.sizes[0]} dimensions in all, not "
                 f"{' and '.join(map(str, shapes))}"
             )
-        outputs = perceptrons(flat, inputs, self.sizes, self.activation, self.norm, self.twice_differentiable)
+        outputs = mlp_forward(flat, inputs, self.sizes, self.activation, self.norm, self.twice_differentiable)
         for axis in self._squeezed:
             outputs = outputs.squeeze(axis)
         return outputs

@@ -1,8 +1,8 @@
-"""The passes of many equal perceptrons as PyTorch's own operations, differentiable any number of times.
+"""The forward pass of many MLPs of the same shape in plain PyTorch operations, differentiable any number of times.
 
     flat [ensemble, runs, P] = W0 [in, h] | b0 [h] | gain0 [h] | shift0 [h] | W1 [h, h] | ... | 0
 
-Gains and shifts are LayerNorm's, and not there without it.
+Gains and shifts are LayerNorm's; without LayerNorm there are none.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import layer_norm
 
 
-def stacked(
+def batched_forward(
     flat: Tensor,
     inputs: Sequence[Tensor],
     sizes: Sequence[int],
@@ -23,19 +23,19 @@ def stacked(
     norm: str = "none",
     dtype: torch.dtype | None = None,
 ) -> Tensor:
-    """Return what `perceptrons` does, all of them at once.
+    """Return the outputs of all MLPs, with one batched matrix product per layer.
 
     Args:
-        dtype: of all products but the last layer's; by default that of `flat`, as the last layer's always is: a Q of
-            300 needs more than bfloat16's 8 bits.
+        dtype: data type of the hidden layers' products, by default that of `flat`. The last layer always has that of
+            `flat`: a Q of 300 needs more than bfloat16's 8 bits.
     """
     x = torch.cat(list(inputs), -1)
     ensemble, (runs, batch, width) = flat.shape[0], x.shape
     h = x.expand(ensemble, runs, batch, width).reshape(ensemble * runs, batch, width)
     *hidden, last = layers_of(flat.reshape(ensemble * runs, -1), sizes, norm)
     for layer, scale in hidden:
-        both = layer.to(dtype or flat.dtype)
-        h = torch.baddbmm(both[:, -1:], h.to(both.dtype), both[:, :-1])
+        cast = layer.to(dtype or flat.dtype)
+        h = torch.baddbmm(cast[:, -1:], h.to(cast.dtype), cast[:, :-1])
         if norm == "before":
             h = _normalize(h.to(flat.dtype), scale)
         h = h.relu() if activation == "relu" else h.tanh()
@@ -45,13 +45,15 @@ def stacked(
     return torch.baddbmm(layer[:, -1:], h.to(layer.dtype), layer[:, :-1]).view(ensemble, runs, batch, -1)
 
 
-def one_by_one(
+def sequential_forward(
     flat: Tensor, inputs: Sequence[Tensor], sizes: Sequence[int], activation: str, norm: str, dtype: torch.dtype | None
 ) -> Tensor:
-    """Return what `stacked` does, one perceptron after the other: a run has the same bits alone and in a stack."""
+    """Return what `batched_forward` does, one MLP after the other: a run has the same bits alone and in a stack."""
     ensemble, runs = flat.shape[:2]
     outputs = [
-        stacked(flat[member, run][None, None], [x[run : run + 1] for x in inputs], sizes, activation, norm, dtype)
+        batched_forward(
+            flat[member, run][None, None], [x[run : run + 1] for x in inputs], sizes, activation, norm, dtype
+        )
         for member, run in itertools.product(range(ensemble), range(runs))
     ]
     return torch.cat(outputs).view(ensemble, runs, *outputs[0].shape[2:])

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from offbench.algorithm.interface import Algorithm
-from offbench.algorithm.mlp import products_by
+from offbench.algorithm.mlp import matmul_backend
 from offbench.data.transitions import Transitions
 from offbench.envs.environments import make_env, spaces_of
 from offbench.rollouts.rollouts import reset, step
-from offbench.training.captured_update import RECORDED_UPDATES
+from offbench.training.captured_update import TRACED_UPDATES
 from offbench.training.devices import arithmetic
 from offbench.training.grouping import stack_size
 from offbench.training.registry import load_algorithm
@@ -52,12 +52,12 @@ def measure(spec: RunSpec, env_spec: str, device: str) -> Rate:
     with arithmetic(device, spec.precision):
         runs = 1 if device == "cpu" else stack_size(spec, random_data(env_spec), device)
         stack = random_stack(load_algorithm(spec.algorithm), [spec.config] * runs, env_spec, device)
-        updates = 2 * RECORDED_UPDATES
+        updates = 2 * TRACED_UPDATES
         while True:
             began, first = time.perf_counter(), stack.step
             for _ in stack.train(first + updates):
                 pass
-            stack.logged()  # waits for the device
+            stack.captured_update.logged()  # waits for the device
             spent = time.perf_counter() - began
             if spent >= SECONDS and first:
                 break
@@ -71,11 +71,11 @@ def operations(spec: RunSpec, env_spec: str) -> float:
     from torch.utils.flop_counter import FlopCounterMode
 
     stack = random_stack(load_algorithm(spec.algorithm), [spec.config], env_spec)
-    stack.program.eager = True
-    for _ in stack.train(2 * RECORDED_UPDATES):  # past work that is done only once
+    stack.captured_update.eager = True
+    for _ in stack.train(2 * TRACED_UPDATES):  # past work that is done only once
         pass
-    with products_by("pytorch"), FlopCounterMode(display=False) as counter:
-        for _ in stack.train(2 * RECORDED_UPDATES + COUNTED):
+    with matmul_backend("pytorch"), FlopCounterMode(display=False) as counter:
+        for _ in stack.train(2 * TRACED_UPDATES + COUNTED):
             pass
     return float(counter.get_total_flops()) / COUNTED
 

@@ -26,8 +26,8 @@ from offbench.training.spec import RunSpec
 CHUNK = 100  # updates whose random numbers are drawn together; part of the definition of a seed: never change it
 
 
-class Store:
-    """The transitions of all runs' datasets on the device, end to end, and where each run's begin.
+class StackData:
+    """The datasets of all runs of a stack on the device, concatenated.
 
     Args:
         specs: the runs.
@@ -55,15 +55,17 @@ class Store:
         self.observations, self.rows = whole["observations"], whole["rows"]
         self.actions, self.rewards, self.masks = whole["actions"], whole["rewards"], whole["masks"]
         self.sizes = [len(used[spec.dataset]) for spec in specs]
-        first = [starts[spec.dataset] for spec in specs]
-        self.chosen: Tensor | None = None  # where runs train on a part: the transitions of each, end to end
+        offsets = [starts[spec.dataset] for spec in specs]
+        self.selected: Tensor | None = None  # where runs train on a part: the transitions of each, concatenated
         shares = [getattr(spec.config, "top", 1.0) for spec in specs]
         if min(shares) < 1:
-            chosen = [used[spec.dataset].best(top) + f for spec, top, f in zip(specs, shares, first, strict=True)]
-            self.sizes = [len(part) for part in chosen]
-            first = [sum(self.sizes[:i]) for i in range(len(specs))]
-            self.chosen = torch.from_numpy(np.concatenate(chosen)).to(device)
-        self.first = torch.tensor(first, device=device).view(-1, 1)
+            parts_of_runs = [
+                used[spec.dataset].best(top) + offset for spec, top, offset in zip(specs, shares, offsets, strict=True)
+            ]
+            self.sizes = [len(part) for part in parts_of_runs]
+            offsets = [sum(self.sizes[:i]) for i in range(len(specs))]
+            self.selected = torch.from_numpy(np.concatenate(parts_of_runs)).to(device)
+        self.offsets = torch.tensor(offsets, device=device).view(-1, 1)
         dim = self.observations.shape[1]
         identity = (np.zeros(dim, np.float32), np.ones(dim, np.float32))
         normalizers = {name: data.normalizer() if normalize_observations else identity for name, data in used.items()}
@@ -71,18 +73,18 @@ class Store:
         self.mean = torch.from_numpy(np.stack([mean for mean, _ in self.normalizers])).to(device).unsqueeze(1)
         self.std = torch.from_numpy(np.stack([std for _, std in self.normalizers])).to(device).unsqueeze(1)
         self.normalize = normalize_observations
-        self.following: Tensor | None = None  # the transition after each, or itself where the data has none
+        self.next_index: Tensor | None = None  # [N], index of the next transition; at an episode's end its own index
         if next_actions:
-            follows = torch.zeros(count, dtype=torch.bool, device=device)
-            follows[:-1] = self.rows[1:] == self.rows[:-1] + 1  # the rows of two episodes have a gap
-            self.following = torch.arange(count, device=device) + follows
-            self.follows = follows.float()
+            has_next = torch.zeros(count, dtype=torch.bool, device=device)
+            has_next[:-1] = self.rows[1:] == self.rows[:-1] + 1  # rows of different episodes are not consecutive
+            self.next_index = torch.arange(count, device=device) + has_next
+            self.has_next = has_next.float()
 
     def batch(self, indices: Tensor) -> Batch:
         """Return the transitions at `indices` [runs, batch], each run's counted from its own first."""
-        flat = (indices + self.first).flatten()
-        if self.chosen is not None:
-            flat = self.chosen.index_select(0, flat)
+        flat = (indices + self.offsets).flatten()
+        if self.selected is not None:
+            flat = self.selected.index_select(0, flat)
         rows = self.rows.index_select(0, flat)
         shape = (*indices.shape, -1)
         observations = self.observations.index_select(0, rows).view(shape)
@@ -91,10 +93,10 @@ class Store:
             observations = (observations - self.mean) / self.std
             next_observations = (next_observations - self.mean) / self.std
         next_actions = next_action_masks = NOT_LOADED
-        if self.following is not None:
-            next_action_masks = self.follows.index_select(0, flat).view(indices.shape)
-            chosen = self.actions.index_select(0, self.following.index_select(0, flat)).view(shape)
-            next_actions = chosen * next_action_masks.unsqueeze(-1)
+        if self.next_index is not None:
+            next_action_masks = self.has_next.index_select(0, flat).view(indices.shape)
+            next_actions = self.actions.index_select(0, self.next_index.index_select(0, flat)).view(shape)
+            next_actions = next_actions * next_action_masks.unsqueeze(-1)
         return Batch(
             observations,
             self.actions.index_select(0, flat).view(shape),

@@ -8,28 +8,28 @@ from collections.abc import Hashable, Mapping
 import torch
 from torch import Tensor
 
-from offbench.algorithm.cpu_capture import NotCapturableError, Recording, attributes, changed_attribute, record
+from offbench.algorithm.cpu_capture import NotCapturableError, Trace, attributes, changed_attribute, trace
 from offbench.algorithm.interface import Algorithm, check_logs
 from offbench.common.errors import OffbenchError
 from offbench.common.terminal import inform
-from offbench.training.batches import Store
+from offbench.training.batches import StackData
 
 Sums = list[tuple[str, float, int]]  # of each logged quantity: its name, its sum, and over how many updates
 # updates of a phase before a replay is trusted on a CPU: all but the first are recorded and compared
-RECORDED_UPDATES = 6
+TRACED_UPDATES = 6
 WATCHED_UPDATES = range(2, 9)  # after which attributes are compared; the first one only tries the code
-RECORD_EVERY = 1000  # updates of a phase between two later records of it
+TRACE_EVERY = 1000  # updates of a phase between two later records of it
 WARM_UP = 3  # updates of a phase before it is captured on a GPU: libraries allocate workspaces in the first ones
 
 
-class Program:
+class CapturedUpdate:
     """Repeats one update of every run.
 
     A counter on the device picks each update's rows of the chunk, and logs are added up on the device, so nothing
     waits for the host.
     """
 
-    def __init__(self, algorithm: Algorithm, store: Store) -> None:
+    def __init__(self, algorithm: Algorithm, store: StackData) -> None:
         self.algorithm, self.store = algorithm, store
         self.device = store.observations.device
         self.position = torch.zeros(1, dtype=torch.int64, device=self.device)
@@ -39,7 +39,7 @@ class Program:
         self.earlier: list[Counter[str]] = [Counter() for _ in store.sizes]  # those, which differ from run to run
         self._names: dict[Hashable, list[str]] = {}  # what each phase logs
         self._graphs: dict[Hashable, torch.cuda.CUDAGraph] = {}
-        self._recordings: dict[Hashable, Recording] = {}
+        self._traces: dict[Hashable, Trace] = {}
         self._done: dict[Hashable, int] = {}  # updates of each phase
         self._count = 0  # updates in this session
         self._lost = ""  # an attribute that the updates change and no checkpoint keeps
@@ -56,7 +56,7 @@ class Program:
         self.position.fill_(first)
 
     def run(self, phase: Hashable) -> None:
-        """Do the next update."""
+        """Perform the next update."""
         self._count += 1
         before = attributes(self.algorithm, in_place=True) if self._count in WATCHED_UPDATES else None
         if self.eager:
@@ -69,9 +69,9 @@ class Program:
             self._warm_up(phase, self._side_stream)
         self.counts.update(self._names[phase])
         if before is not None:
-            self._watch(before)
+            self._report_lost_attribute(before)
 
-    def _watch(self, before: dict[str, object]) -> None:
+    def _report_lost_attribute(self, before: dict[str, object]) -> None:
         """Print which attribute an update changes that no checkpoint keeps, once."""
         changed = changed_attribute(before, attributes(self.algorithm, in_place=True), first=True)
         if changed and not self._lost:
@@ -83,32 +83,32 @@ class Program:
             )
 
     def _run_captured(self, phase: Hashable) -> None:
-        """Do an update on the CPU: the first of a phase eagerly, the next ones recorded, the rest replayed.
+        """Perform an update on the CPU: the first of a phase eagerly, the next ones recorded, the rest replayed.
 
-        Every RECORD_EVERY-th is recorded again, so that an update that changes later on is noticed.
+        Every TRACE_EVERY-th is recorded again, so that an update that changes later on is noticed.
         """
         done = self._done[phase] = self._done.get(phase, 0) + 1
-        if done > RECORDED_UPDATES and done % RECORD_EVERY:
+        if done > TRACED_UPDATES and done % TRACE_EVERY:
             with torch.inference_mode():
-                self._recordings[phase].replay()
+                self._traces[phase].replay()
             return
-        before, recording = attributes(self.algorithm), None
+        before, latest = attributes(self.algorithm), None
         try:
             if done == 1:
                 self._update(phase)
             else:
-                recording = record(lambda: self._update(phase))
+                latest = trace(lambda: self._update(phase))
         except NotCapturableError as error:
             self._run_eagerly(f"cannot be captured ({error})")
             return
         changed = changed_attribute(before, attributes(self.algorithm), first=done == 1)
         reason = f"changes the attribute {changed}" if changed else ""
-        if recording is not None:
-            if phase in self._recordings and not recording.same_as(self._recordings[phase]):
+        if latest is not None:
+            if phase in self._traces and not latest.same_as(self._traces[phase]):
                 reason = reason or f"is not the same at every update of phase {phase!r}"
-            if done <= RECORDED_UPDATES:  # a later recording is only compared with the one in use
-                self._recordings[phase] = recording
-        if reason and done > RECORDED_UPDATES:
+            if done <= TRACED_UPDATES:  # a later latest is only compared with the one in use
+                self._traces[phase] = latest
+        if reason and done > TRACED_UPDATES:
             name = type(self.algorithm).__name__
             raise OffbenchError(
                 f"{name}.update {reason} after {done:,} updates; let `phase` tell apart what differs, or set "
@@ -119,12 +119,12 @@ class Program:
 
     def _run_eagerly(self, reason: str) -> None:
         self.eager = True
-        self._recordings, self._graphs = {}, {}
+        self._traces, self._graphs = {}, {}
         name = type(self.algorithm).__name__
         inform(f"{name}.update {reason}: updates run without capture, which is slower")
 
     def _warm_up(self, phase: Hashable, side: torch.cuda.Stream) -> None:
-        """Do one of the first updates of a phase eagerly; after a few, capture the phase for the later ones."""
+        """Perform one of the first updates of a phase eagerly; after a few, capture the phase for the later ones."""
         done = self._done[phase] = self._done.get(phase, 0) + 1
         before = attributes(self.algorithm)
         side.wait_stream(torch.cuda.current_stream(self.device))

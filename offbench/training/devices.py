@@ -11,7 +11,7 @@ import numpy as np
 import threadpoolctl
 import torch
 
-from offbench.algorithm.mlp import products_by
+from offbench.algorithm.mlp import matmul_backend
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import default_workers
 from offbench.common.provenance import has_bfloat16
@@ -92,7 +92,7 @@ def arithmetic(device: str, precision: str = "float32") -> Iterator[None]:
     On the CPU one thread, NumPy's products included: two runs in two processes beat one run on two threads.
 
     Args:
-        precision: float32, tf32 (float32 with 10 bits of mantissa in products) or bfloat16 (`perceptrons`).
+        precision: float32, tf32 (float32 with 10 bits of mantissa in products) or bfloat16 (`mlp_forward`).
 
     Raises:
         OffbenchError: the device does not support the precision.
@@ -103,7 +103,7 @@ def arithmetic(device: str, precision: str = "float32") -> Iterator[None]:
     with ExitStack() as undo:
         undo.callback(torch.set_float32_matmul_precision, before)
         if precision == "bfloat16":
-            undo.enter_context(products_by("bfloat16"))
+            undo.enter_context(matmul_backend("bfloat16"))
         if device == "cpu":
             torch.set_num_threads(1)
             undo.callback(torch.set_num_threads, threads)

@@ -17,8 +17,8 @@ from offbench.common.files import JsonObject
 from offbench.common.settings import short_repr
 from offbench.data.transitions import Transitions
 from offbench.rollouts.policy import Policy, check_networks
-from offbench.training.batches import CHUNK, Store, draw_chunk
-from offbench.training.captured_update import Program
+from offbench.training.batches import CHUNK, StackData, draw_chunk
+from offbench.training.captured_update import CapturedUpdate
 from offbench.training.spec import RunSpec, settings_json
 
 Layers = Sequence[tuple[Tensor, Tensor]]
@@ -55,11 +55,11 @@ class Stack:
                 f"{algorithm_class.__name__} has no networks among its attributes: a checkpoint would be empty"
             )
         self.batch_size: int = config.batch_size
-        self.store = Store(specs, datasets, config.normalize, self.device, self.algorithm.uses_next_actions)
+        self.store = StackData(specs, datasets, config.normalize, self.device, self.algorithm.uses_next_actions)
         self.noise_spec = self.algorithm.noise_spec(self.algorithm.config)
         check_noise_spec(self.noise_spec, f"{algorithm_class.__name__}.noise_spec")
         _check_phase(self.algorithm)
-        self.program = Program(self.algorithm, self.store)
+        self.captured_update = CapturedUpdate(self.algorithm, self.store)
         self.step = 0
 
     def train(self, until: int) -> Iterator[int]:
@@ -67,15 +67,11 @@ class Stack:
         while self.step < until:
             chunk, first = divmod(self.step, CHUNK)
             drawn = draw_chunk(self.seeds, self.store.sizes, self.batch_size, self.noise_spec, chunk, self.device)
-            self.program.load(*drawn, first)
+            self.captured_update.load(*drawn, first)
             for _ in range(first, min(CHUNK, first + until - self.step)):
-                self.program.run(self.algorithm.phase(self.step))
+                self.captured_update.run(self.algorithm.phase(self.step))
                 self.step += 1
             yield self.step
-
-    def logged(self) -> list[dict[str, float]]:
-        """Return each run's mean of everything logged since the last call."""
-        return self.program.logged()
 
     def policy(self, run: int) -> Policy:
         """Return one run's policy as it is now, for the NumPy rollouts and the policy file."""

@@ -117,7 +117,7 @@ class Trainer:
         for step in self.stack.train(stop):
             late = self.job.deadline_passed and step < stop
             if step % LOG_EVERY == 0 or step == stop:
-                for rows, row in zip(self.losses, self.stack.logged(), strict=True):
+                for rows, row in zip(self.losses, self.stack.captured_update.logged(), strict=True):
                     rows.append({"step": step, **row})
             if self.pending and all(future.done() for *_, futures in self.pending for future in futures):
                 self._collect()
@@ -160,7 +160,7 @@ class Trainer:
             if all(loaded):
                 for i, (tensors, state) in enumerate(checkpoint for checkpoint in loaded if checkpoint):
                     self.stack.load(i, tensors, state)
-                    self.stack.program.resume_logging(i, state.get("unlogged", []))
+                    self.stack.captured_update.resume_logging(i, state.get("unlogged", []))
                 self.stack.step = step
                 break
         for i, run in enumerate(self.runs):
@@ -188,7 +188,7 @@ class Trainer:
                 run.write_losses(self.losses[i])
                 self.stack.policy(i).save(run.policy_path)
                 state: JsonObject = {"step": step, "origin": self.stack.identity(i)}
-                unlogged = self.stack.program.unlogged(i)
+                unlogged = self.stack.captured_update.unlogged(i)
                 if unlogged:  # stopped between two rows of losses.csv
                     state["unlogged"] = unlogged
                 checkpoints.save_checkpoint(run.folder, step, slice_of(tensors, i), state)

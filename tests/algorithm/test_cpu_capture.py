@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from offbench.algorithm import Algorithm, Batch, Logs, Noise
-from offbench.algorithm.cpu_capture import NotCapturableError, record
+from offbench.algorithm.cpu_capture import NotCapturableError, trace
 from offbench.benchmarks.throughput import random_stack
 from offbench.common.errors import OffbenchError
 from offbench.common.settings import build, setting
@@ -30,7 +30,7 @@ def stack_of(kind: type, runs: int = 1, device: str = "cpu", **settings: Any) ->
 def trained(stack: Stack, steps: int) -> tuple[dict[str, Tensor], list[dict[str, float]]]:
     for _ in stack.train(steps):
         pass
-    return {name: tensor.detach().clone() for name, tensor in stack.tensors().items()}, stack.logged()
+    return {name: tensor.detach().clone() for name, tensor in stack.tensors().items()}, stack.captured_update.logged()
 
 
 SMALL = {"hidden": "16,16", "batch_size": "32"}
@@ -62,11 +62,11 @@ def test_a_replayed_update_has_the_bits_of_an_eager_one(
 ) -> None:
     kind = load_algorithm(algorithm)
     replayed, eager = (stack_of(kind, runs, **(SMALL | settings)) for _ in range(2))
-    eager.program.eager = True
+    eager.captured_update.eager = True
     with arithmetic("cpu", precision):
         ours, theirs = trained(replayed, 60), trained(eager, 60)
-    assert not replayed.program.eager
-    assert replayed.program._recordings
+    assert not replayed.captured_update.eager
+    assert replayed.captured_update._traces
     assert ours[1] == theirs[1]
     assert all(torch.equal(ours[0][name], theirs[0][name]) for name in theirs[0])
 
@@ -208,13 +208,13 @@ def test_what_cannot_be_replayed_runs_as_it_is_and_says_so(kind: type, capsys: p
     torch.manual_seed(0)
     ours = stack_of(kind)
     found = trained(ours, 50)
-    assert ours.program.eager
+    assert ours.captured_update.eager
     said = capsys.readouterr().err
     assert said.count("without capture") == 1
     assert f"{kind.__name__}.update" in said
     torch.manual_seed(0)
     eager = stack_of(kind)
-    eager.program.eager = True
+    eager.captured_update.eager = True
     wanted = trained(eager, 50)
     assert all(torch.equal(found[0][name], wanted[0][name]) for name in wanted[0])
 
@@ -222,9 +222,9 @@ def test_what_cannot_be_replayed_runs_as_it_is_and_says_so(kind: type, capsys: p
 @pytest.mark.parametrize("kind", [Plain, Converts, ChangesInPlace])
 def test_what_does_the_same_at_every_update_is_replayed(kind: type, capsys: pytest.CaptureFixture[str]) -> None:
     ours, eager = stack_of(kind), stack_of(kind)
-    eager.program.eager = True
+    eager.captured_update.eager = True
     assert torch.equal(trained(ours, 50)[0]["actor.flat"], trained(eager, 50)[0]["actor.flat"])
-    assert not ours.program.eager
+    assert not ours.captured_update.eager
     said = capsys.readouterr().err
     lost = "ChangesInPlace.update changes the attribute mean, which no checkpoint keeps: a resumed run begins with"
     assert said.count(lost) == (2 if kind is ChangesInPlace else 0)  # of each stack
@@ -232,7 +232,7 @@ def test_what_does_the_same_at_every_update_is_replayed(kind: type, capsys: pyte
 
 
 def test_an_update_that_changes_later_on_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(captured_update, "RECORD_EVERY", 20)
+    monkeypatch.setattr(captured_update, "TRACE_EVERY", 20)
 
     class Later(Plain):
         def setup(self, c: Config) -> None:
@@ -248,7 +248,7 @@ def test_an_update_that_changes_later_on_is_refused(monkeypatch: pytest.MonkeyPa
     Later.capture = False
     ours = stack_of(Later)
     trained(ours, 100)
-    assert not ours.program._recordings
+    assert not ours.captured_update._traces
 
 
 def test_a_record_is_done_as_well() -> None:
@@ -257,13 +257,13 @@ def test_a_record_is_done_as_well() -> None:
     def update() -> None:
         total.add_(torch.ones(3) * 2)
 
-    recording = record(update)
+    recorded = trace(update)
     assert total.tolist() == [2, 2, 2]
-    recording.replay()
+    recorded.replay()
     assert total.tolist() == [4, 4, 4]
     with pytest.raises(NotCapturableError, match=r"item|local_scalar"):
-        record(lambda: total.sum().item())
-    first, again = (record(lambda: total.mul_(float("nan"))) for _ in range(2))
+        trace(lambda: total.sum().item())
+    first, again = (trace(lambda: total.mul_(float("nan"))) for _ in range(2))
     assert first.same_as(again)
     with pytest.raises(NotCapturableError, match=r"draws random numbers by aten\.rand.*resumed run.*noise_spec"):
-        record(lambda: torch.rand(3))
+        trace(lambda: torch.rand(3))

@@ -1,4 +1,4 @@
-"""What networks and batches offer beyond plain perceptrons, against PyTorch's own and by hand."""
+"""What networks and batches offer beyond plain MLPs, against PyTorch's own and by hand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 import offbench
 from offbench.algorithm import Batch, Logs, Network, Noise, NoiseSpec, cosine_decay, linear_decay, normal
 from offbench.common.errors import OffbenchError
-from offbench.training.batches import Store
+from offbench.training.batches import StackData
 from offbench.training.spec import RunSpec
 from tests.algorithm.test_cpu_capture import Plain, stack_of, trained
 from tests.algorithm.test_references import networks
@@ -90,9 +90,9 @@ class Penalized(Plain):
 
 def test_a_gradient_penalty_is_replayed_with_the_same_bits() -> None:
     ours, eager = stack_of(Penalized, 2), stack_of(Penalized, 2)
-    eager.program.eager = True
+    eager.captured_update.eager = True
     (found, logs), (expected, others) = trained(ours, 40), trained(eager, 40)
-    assert not ours.program.eager
+    assert not ours.captured_update.eager
     assert logs == others
     assert all(torch.equal(found[name], expected[name]) for name in expected)
     assert logs[0]["penalty"] > 0
@@ -129,7 +129,7 @@ def test_next_actions_by_hand(home: Any) -> None:
     datasets = {name: offbench.load(name) for name in kinds}
     config = Plain.Config()
     specs = [RunSpec("x", config, name, 0, 1, 1, 1, home) for name in kinds]
-    batch = Store(specs, datasets, True, torch.device("cpu"), True).batch(torch.arange(5).repeat(2, 1))
+    batch = StackData(specs, datasets, True, torch.device("cpu"), True).batch(torch.arange(5).repeat(2, 1))
     for run, name in enumerate(kinds):
         actions = torch.from_numpy(np.array(datasets[name].actions))
         assert torch.equal(batch.actions[run], actions)
@@ -137,6 +137,6 @@ def test_next_actions_by_hand(home: Any) -> None:
         for index in range(5):
             expected = actions[index + 1] if index in (0, 1, 3) else torch.zeros(2)
             assert torch.equal(batch.next_actions[run, index], expected)
-    without = Store(specs, datasets, True, torch.device("cpu")).batch(torch.arange(5).repeat(2, 1))
+    without = StackData(specs, datasets, True, torch.device("cpu")).batch(torch.arange(5).repeat(2, 1))
     with pytest.raises(RuntimeError):
         without.actions - without.next_actions

@@ -46,7 +46,7 @@ def stack_of(algorithm: str, runs: int, device: str, *, captured: bool = True, *
         configs.append(build(kind.Config, own, algorithm))
     stack = random_stack(kind, configs, spec, device)
     if not captured:
-        stack.program._side = None
+        stack.captured_update._side = None
     return stack
 
 
@@ -72,7 +72,7 @@ def advance(stack: Stack, updates: int) -> int:
     """Do so many updates and wait for them."""
     for _ in stack.train(stack.step + updates):
         pass
-    stack.logged()
+    stack.captured_update.logged()
     return updates
 
 

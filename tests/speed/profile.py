@@ -18,15 +18,15 @@ import torch
 from offbench.agents.ladder import read_ladder
 from offbench.algorithm import mlp
 from offbench.algorithm.bfloat16_layer import Bfloat16Layer
-from offbench.algorithm.cpu_capture import Recording
-from offbench.algorithm.mlp import products_by
+from offbench.algorithm.cpu_capture import Trace
+from offbench.algorithm.mlp import matmul_backend
 from offbench.common.files import write_bytes
 from offbench.common.provenance import hardware, has_bfloat16
 from offbench.common.tables import markdown
 from offbench.envs.environments import make_env
 from offbench.envs.recipes import load_recipe
 from offbench.rollouts.rollouts import PARALLEL_EPISODES, Task, play
-from offbench.training.captured_update import RECORDED_UPDATES
+from offbench.training.captured_update import TRACED_UPDATES
 from tests.speed.__main__ import DOCS
 from tests.speed.sides import ENV, stack_of
 
@@ -80,11 +80,11 @@ def recording() -> dict[str, float]:
 
 def update(algorithm: str, precision: str) -> dict[str, float]:
     """Return milliseconds of an update (2-layer networks), by what a replay calls."""
-    with products_by("bfloat16" if precision == "bfloat16" else "numpy"):
+    with matmul_backend("bfloat16" if precision == "bfloat16" else "numpy"):
         stack = stack_of(algorithm)
-        for _ in stack.train(2 * RECORDED_UPDATES):  # records each phase
+        for _ in stack.train(2 * TRACED_UPDATES):  # records each phase
             pass
-    kinds = [list(calls(recording)) for recording in stack.program._recordings.values()]
+    kinds = [list(calls(recording)) for recording in stack.captured_update._traces.values()]
     spent: dict[str, float] = {}
     with torch.inference_mode():
         for part, call in itertools.chain(*kinds):
@@ -97,16 +97,16 @@ def update(algorithm: str, precision: str) -> dict[str, float]:
     return spent
 
 
-def calls(recording: Recording) -> Iterator[tuple[str, Callable[[], object]]]:
+def calls(trace: Trace) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield each call of a replay, those within the networks' passes one by one, with the part that it belongs to."""
-    for call in recording.calls:
+    for call in trace.calls:
         owner = getattr(call, "__self__", None)
-        if isinstance(owner, mlp.Pass | mlp.PassBack):
+        if isinstance(owner, mlp.ForwardPass | mlp.BackwardPass):
             for inner in owner.calls:
                 function = inner.func if isinstance(inner, partial) else inner
-                half = isinstance(getattr(function, "__self__", None), Bfloat16Layer)
+                bfloat16 = isinstance(getattr(function, "__self__", None), Bfloat16Layer)
                 named = {np.matmul: PRODUCTS, np.copyto: REST}
-                yield HALVES if half else named.get(function, ACTIVATIONS), inner
+                yield HALVES if bfloat16 else named.get(function, ACTIVATIONS), inner
         else:
             function = call.func if isinstance(call, partial) else call
             name = getattr(function, "__name__", str(function))

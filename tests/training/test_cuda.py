@@ -68,11 +68,11 @@ def test_a_gpu_learns_what_the_cpu_does(algorithm: str, settings: dict[str, str]
 @pytest.mark.parametrize(("algorithm", "settings"), CASES)
 def test_a_captured_update_equals_a_plain_one(algorithm: str, settings: dict[str, str], precision: str) -> None:
     captured, plain = (stack_on("cuda", algorithm, settings) for _ in range(2))
-    plain.program.eager = True
+    plain.captured_update.eager = True
     with arithmetic("cuda", precision):
         ours, theirs = trained(captured, UPDATES), trained(plain, UPDATES)
-    assert captured.program._graphs
-    assert not plain.program._graphs
+    assert captured.captured_update._graphs
+    assert not plain.captured_update._graphs
     assert_same_learning(ours, theirs, tolerance=1e-5 if precision == "float32" else 1e-3)
 
 
