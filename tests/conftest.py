@@ -71,7 +71,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("OFFBENCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(registry, "_own", {})
+    monkeypatch.setattr(registry, "_user_algorithms", {})
     monkeypatch.setenv(registry.OWN_VARIABLE, "{}")
     yield tmp_path
     forget_modules(tmp_path)

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 from offbench.common.errors import OffbenchError, nearest, unknown
 from offbench.common.text import without_steps
-from offbench.training.registry import FORMER_SETTINGS, algorithm_names
+from offbench.training.former_settings import FORMER_SETTINGS
+from offbench.training.registry import algorithm_names
 from offbench.training.run_config import RunConfig
 from offbench.training.spec import folder_name
 

@@ -91,7 +91,7 @@ def benchmark(
     for line in training.diverged:  # in an earlier call, which raised for it
         say(line)
     raise_first(training.run(executor.train, deadline=deadline, cost=plan.update_seconds))
-    return not training.pending()
+    return not training.unfinished_jobs()
 
 
 def _seconds(text: str) -> float:

@@ -29,7 +29,7 @@ from offbench.common.text import LARGEST_INTEGER, MOST_SEEDS
 from offbench.data import minari_store
 from offbench.data.levels import env_and_level, level_argument, parse_level, recipe_and_level
 from offbench.envs.recipes import load_recipe
-from offbench.training.spec import Times
+from offbench.training.spec import TrainingSchedule
 
 LONGEST_LABEL = 60
 
@@ -52,7 +52,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Entry:
-    """An algorithm of a grid with its settings (each value of a list is a variant) and its times.
+    """An algorithm of a grid with its settings (each value of a list is a variant) and its schedule.
 
     Attributes:
         label: the name in tables, if the settings are one variant; empty for the usual name.
@@ -61,7 +61,7 @@ class Entry:
 
     algorithm: str
     settings: Mapping[str, object]
-    times: Times
+    schedule: TrainingSchedule
     datasets: tuple[str, ...]
     label: str = ""
 
@@ -103,10 +103,10 @@ def load_grid(name: str) -> Grid:
         raise OffbenchError(f"no grid file {path}; shipped grids: {', '.join(shipped_grids())}") from None
     sources = _list(values.pop("datasets", []), "datasets", where)
     entries = _list(values.pop("algorithms", []), "algorithms", where)
-    times = _times(values, Times(), where)
+    schedule = _schedule(values, TrainingSchedule(), where)
     datasets = tuple(_source(value, path.parent, where) for value in sources)
     ids = [source.id for source in datasets]
-    return Grid(path.stem, datasets, tuple(_entry(value, times, ids, path.parent, where) for value in entries))
+    return Grid(path.stem, datasets, tuple(_entry(value, schedule, ids, path.parent, where) for value in entries))
 
 
 def _list(value: object, key: str, where: str) -> list[object]:
@@ -115,7 +115,7 @@ def _list(value: object, key: str, where: str) -> list[object]:
     return value
 
 
-def _times(values: JsonObject, default: Times, where: str) -> Times:
+def _schedule(values: JsonObject, default: TrainingSchedule, where: str) -> TrainingSchedule:
     """Return `default` with the changes in `values`."""
     merged = dataclasses.asdict(default) | values
     seeds = merged.pop("seeds")
@@ -126,7 +126,7 @@ def _times(values: JsonObject, default: Times, where: str) -> Times:
         raise OffbenchError(
             f"{where}: seeds must be a count or a list of different whole numbers, not {short_repr(seeds)}"
         )
-    return build(Times, merged | {"seeds": tuple(seeds)}, where)
+    return build(TrainingSchedule, merged | {"seeds": tuple(seeds)}, where)
 
 
 def _source(value: object, folder: Path, where: str) -> Source:
@@ -167,12 +167,12 @@ def _recipe_of(dataset_id: str) -> tuple[str, str]:
     return env, level
 
 
-def _entry(value: object, times: Times, ids: Sequence[str], folder: Path, where: str) -> Entry:
+def _entry(value: object, schedule: TrainingSchedule, ids: Sequence[str], folder: Path, where: str) -> Entry:
     if not isinstance(value, dict) or not isinstance(value.get("name"), str):
         raise OffbenchError(f"{where}: each of [[algorithms]] needs a name")
-    own = {field.name for field in dataclasses.fields(Times)}
+    own = {field.name for field in dataclasses.fields(TrainingSchedule)}
     entry = f"{where}: {value['name']}"
-    changed = _times({key: item for key, item in value.items() if key in own}, times, entry)
+    changed = _schedule({key: item for key, item in value.items() if key in own}, schedule, entry)
     label = value.get("label", "")
     if not isinstance(label, str) or len(label) > LONGEST_LABEL or not label.isprintable():
         raise OffbenchError(

@@ -84,7 +84,7 @@ def prepare(
             entry.algorithm,
             entry.settings,
             entry.datasets,
-            entry.times,
+            entry.schedule,
             Path(runs),
             precision,
             env_spec,

@@ -32,9 +32,9 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import write_bytes
 from offbench.common.processes import environment
 from offbench.data import minari_store
-from offbench.training.grouping import by_common_step
+from offbench.training.claim import by_common_step
 from offbench.training.jobs import JobProgress, raise_first, train_job
-from offbench.training.registry import own_algorithm, register
+from offbench.training.registry import register, user_algorithm
 from offbench.training.source_code import own_modules
 from offbench.training.spec import Job, RunSpec
 
@@ -124,7 +124,7 @@ class RayExecutor:
         for module in own_modules(algorithm):
             cloudpickle.register_pickle_by_value(module)
         try:
-            cloudpickle.dumps(own_algorithm(algorithm))
+            cloudpickle.dumps(user_algorithm(algorithm))
         except Exception as error:  # whatever its globals raise
             raise OffbenchError(
                 f"the code of {algorithm} cannot be sent to the nodes ({error}); install it as a package on each"
@@ -134,7 +134,7 @@ class RayExecutor:
         gpu = {"num_gpus": 1} if job.device != "cpu" else {}
         task = self.ray.remote(**self._options, **gpu)(_train)
         rest = replace(job, specs=unfinished(job))
-        own = own_algorithm(job.first.algorithm)
+        own = user_algorithm(job.first.algorithm)
         return task.remote(rest, own, self.slice, index, str(minari_store.root().resolve()), token, self.server)
 
     def _result(self, ref: ObjectRef, job: Job) -> tuple[bool, list[str]]:

@@ -16,7 +16,7 @@ from offbench.data.transitions import Transitions
 from offbench.envs.environments import make_env, spaces_of
 from offbench.rollouts.rollouts import reset, step
 from offbench.training.captured_update import TRACED_UPDATES
-from offbench.training.devices import arithmetic
+from offbench.training.devices import matmul_settings
 from offbench.training.grouping import stack_size
 from offbench.training.registry import load_algorithm
 from offbench.training.spec import RunSpec
@@ -49,7 +49,7 @@ def measure(spec: RunSpec, env_spec: str, device: str) -> Rate:
 
     It is one run on a CPU, and a stack of what fits on a GPU.
     """
-    with arithmetic(device, spec.precision):
+    with matmul_settings(device, spec.precision):
         runs = 1 if device == "cpu" else stack_size(spec, random_data(env_spec), device)
         stack = random_stack(load_algorithm(spec.algorithm), [spec.config] * runs, env_spec, device)
         updates = 2 * TRACED_UPDATES

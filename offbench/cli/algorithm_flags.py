@@ -68,7 +68,7 @@ def notices(config: type, settings: Mapping[str, object]) -> Iterator[str]:
 
 def moved_flag(algorithm: str, words: list[str]) -> str | None:
     """Return the first flag that bdb had in earlier versions and bdb_plus has now; None if there is none."""
-    from offbench.training.registry import MOVED
+    from offbench.training.former_settings import MOVED
 
     if algorithm != "bdb":
         return None

@@ -17,7 +17,7 @@ from offbench.common.files import disk_errors
 from offbench.common.interrupts import stop_handlers
 from offbench.common.terminal import labeled
 from offbench.common.text import printable
-from offbench.training.registry import describe_failure
+from offbench.training.failures import describe_failure
 
 COMMANDS: dict[str, dict[str, Command]] = {
     "Data": {

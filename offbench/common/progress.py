@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from offbench.common.terminal import console, is_terminal
 from offbench.common.text import printable
@@ -21,26 +21,25 @@ NARROWEST_BAR = 18  # columns of the bar, its percents and the space around them
 
 
 class Progress:
-    """Shows how many of a total number of steps are done, on stderr; stdout is for results.
+    """Shows on stderr how many of a total number of steps are done; stdout is for results.
 
-    Where steps differ in cost, their work (in seconds, or any other unit) is counted beside them, for the time left.
-    Without a terminal, every new note (such as the score of an evaluation) gets a line, and so does every half minute.
+    If steps differ in cost, the time left is estimated from their work, in seconds or any other unit. Without a
+    terminal, a line is printed for every new note (such as the score of an evaluation), and every half minute.
     """
 
-    def __init__(self, total: int, what: str, start: int = 0, work: float | None = None) -> None:
+    def __init__(self, total: int, what: str, work: float | None = None) -> None:
         what = printable(what)
-        self.total, self.what, self.done = total, what, start
+        self.total, self.what, self.done = total, what, 0
         self._work: float = total if work is None else work
-        self._worked: float = start
-        self._first_work: float = start
-        self._first, self._note, self._printed = start, "", -1
+        self._worked = self._first_work = 0.0
+        self._first, self._note, self._printed = 0, "", -1
         self._began = self._last = time.monotonic()
         self._bar: Bar | None = None
         if is_terminal(sys.stderr):
             self._bar = bar = _bar()
-            self._task = bar.add_task(what, total=total, completed=start, details=self._details(bar), note="")
+            self._task = bar.add_task(what, total=total, completed=0, details=self._details(bar), note="")
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> Self:
         if self._bar is not None:
             try:
                 self._bar.start()

@@ -76,7 +76,7 @@ def similarity(
     """
     import torch  # slow to import; reports only read similarity.json
 
-    from offbench.training.train import restore
+    from offbench.training.restore import restore
 
     run = Run(Path(path))
     stack = restore(run, algorithm)

@@ -1,4 +1,4 @@
-"""The machine that runs train on: its device, its processes and the precision of its products."""
+"""The machine that runs train on: its device, its processes and the precision of matrix multiplications."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def pick_device(device: str) -> str:
 
 
 def check_precision(precision: str, device: str) -> None:
-    """Raise OffbenchError if a device (cpu or cuda:N) does not support a precision of matrix products."""
+    """Raise OffbenchError if a device (cpu or cuda:N) does not support a precision of matrix multiplications."""
     if precision not in PRECISIONS:
         raise OffbenchError(f"precision must be {', '.join(PRECISIONS[:-1])} or {PRECISIONS[-1]}, not {precision!r}")
     if precision == "tf32" and device == "cpu":
@@ -86,13 +86,13 @@ def check_precision(precision: str, device: str) -> None:
 
 
 @contextmanager
-def arithmetic(device: str, precision: str = "float32") -> Iterator[None]:
-    """Set the threads and the precision of matrix products for training, and restore them afterwards.
+def matmul_settings(device: str, precision: str = "float32") -> Iterator[None]:
+    """Set the number of threads and the precision of matrix multiplications for training; restore them afterwards.
 
-    On the CPU one thread, NumPy's products included: two runs in two processes beat one run on two threads.
+    On the CPU there is one thread, for NumPy too: two runs in two processes are faster than one run on two threads.
 
     Args:
-        precision: float32, tf32 (float32 with 10 bits of mantissa in products) or bfloat16 (`mlp_forward`).
+        precision: float32, tf32 (float32 with 10 bits of mantissa in multiplications) or bfloat16 (`mlp_forward`).
 
     Raises:
         OffbenchError: the device does not support the precision.

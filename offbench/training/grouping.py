@@ -1,90 +1,40 @@
-"""Which runs train together, and what is left to train of them.
+"""Which runs train together: same algorithm, environment, shapes, schedule and settings that are not `per_run`.
 
-group      runs to jobs: same algorithm, environment, shapes, times and settings that are not `per_run`, in groups that
-           fit the device and leave no process idle. It does not depend on what is trained already
-pending    what is left of a job: runs at one common step; finished and diverged ones are left out
+Groups fit the device and leave no process idle. They do not depend on what is trained already.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import gc
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from offbench.common import checkpoints
-from offbench.common.code_hash import changes
-from offbench.common.errors import OffbenchError
-from offbench.common.provenance import training_platform
 from offbench.common.settings import fields
-from offbench.common.terminal import inform, warn
-from offbench.data import transitions
-from offbench.data.minari_store import provenance
-from offbench.data.recorded_env import report_margin_rule
 from offbench.data.transitions import Transitions
-from offbench.envs.environment_code import environment_code
-from offbench.envs.environments import checked_spec, same_environment
-from offbench.envs.recipes import d4rl_reference
-from offbench.envs.version_warning import warn_other_physics
+from offbench.envs.environments import same_environment
 from offbench.training.captured_update import WARM_UP
+from offbench.training.datasets import Datasets
 from offbench.training.devices import Machine
 from offbench.training.registry import load_algorithm
-from offbench.training.run import TRAIN_ANEW
-from offbench.training.run_config import RunConfig
-from offbench.training.source_code import code_of
-from offbench.training.spec import Job, RunSpec, settings_json
+from offbench.training.spec import Job, RunSpec
 from offbench.training.stack import Stack
 
-CPU_STACK = 8  # runs of one process: more runs gain nothing there, and each waits for all of them
-MEMORY_SHARE = 0.8  # of a GPU's free memory that a stack may take
-
-Datasets = Mapping[str, Transitions]
-
-
-def load_datasets(specs: Sequence[RunSpec]) -> dict[str, Transitions]:
-    """Return the runs' datasets by name, with the environment to evaluate in if the runs name another.
-
-    Raises OffbenchError if one is missing or damaged.
-    """
-    named = {spec.dataset: spec.env_spec for spec in specs}
-    return {name: dataclasses.replace(transitions.load(name), evaluated_in=env) for name, env in named.items()}
-
-
-def check_datasets(datasets: Datasets) -> None:
-    """Check that the datasets' environments can be evaluated in, and warn of what may change the scores.
-
-    Raises:
-        OffbenchError: an environment cannot be made, or does not fit its dataset.
-    """
-    for name, data in datasets.items():
-        if data.env_spec:
-            checked_spec(data.env_spec, name, data.observations.shape[1], data.low, data.high)
-            recorded = provenance(data.metadata)
-            if data.evaluated_in is None:
-                report_margin_rule(name, data.metadata, data.env_spec)
-                if changed := changes(recorded.env_code, environment_code(data.env_spec)):
-                    warn(f"{name} was recorded in other code of its environment: {changed}; scores may not compare")
-            warn_other_physics(name, recorded.versions, data.env_spec)
-        else:
-            inform(
-                f"{name} names no environment, so nothing is evaluated during training; "
-                "`offbench train --env RECIPE` names one"
-            )
+CPU_STACK = 8  # runs of one process: more gain nothing there, and each waits for all others
+MEMORY_SHARE = 0.8  # share of a GPU's free memory that a stack may use
 
 
 def group(specs: Sequence[RunSpec], datasets: Datasets, machine: Machine) -> list[Job]:
-    """Return the runs in jobs for a machine."""
+    """Group runs into jobs for a machine."""
     jobs = []
     workers = 0 if machine.device == "cpu" else machine.workers
-    by_times: dict[tuple[int, int, int], list[RunSpec]] = {}
+    by_schedule: dict[tuple[int, int, int], list[RunSpec]] = {}
     for spec in specs:
-        by_times.setdefault(spec.times, []).append(spec)
-    for same_times in by_times.values():
-        compatible = _compatible_groups(same_times, datasets)
-        share = max(1, machine.processes // len(compatible))  # of the processes, for each group
+        by_schedule.setdefault(spec.schedule, []).append(spec)
+    for same_schedule in by_schedule.values():
+        compatible = _compatible_groups(same_schedule, datasets)
+        share = max(1, machine.processes // len(compatible))  # number of processes for each group
         for runs in compatible:
             size = machine.stack
             if isinstance(size, str):
@@ -133,102 +83,3 @@ def _compatible_groups(specs: Sequence[RunSpec], datasets: Datasets) -> list[lis
         else:
             groups.append((key, [spec]))
     return [runs for _, runs in groups]
-
-
-def check_folders(job: Job, datasets: Datasets) -> None:
-    """Check that the runs' folders can be claimed, before any of them is. Raises OffbenchError if one cannot."""
-    for spec in job.specs:
-        spec.run.check(run_config(spec, datasets[spec.dataset], job.device, ""))
-
-
-def pending(job: Job, datasets: Datasets, *, command: str = "") -> list[Job]:
-    """Claim the runs' folders, and return what is left to train of them.
-
-    Args:
-        command: what the user typed, for config.json.
-
-    Raises:
-        OffbenchError: a folder holds another run, a run lacks files, or is further than its last step.
-    """
-    for spec in job.specs:
-        data = datasets[spec.dataset]
-        spec.run.claim(run_config(spec, data, job.device, command))
-        _check_environment(spec, data)
-        if data.env_spec:
-            _check_evaluations(spec)
-    left = [spec for spec in job.specs if not spec.run.diverged]
-    return [dataclasses.replace(job, specs=tuple(specs)) for specs in by_common_step(left)]
-
-
-def by_common_step(specs: Sequence[RunSpec]) -> list[list[RunSpec]]:
-    """Group unfinished runs of one job that can resume from a common step; runs without a checkpoint begin together.
-
-    A job that was killed while it wrote its checkpoints has runs that are one checkpoint apart: they resume from the
-    older one.
-
-    Raises:
-        OffbenchError: a run is further than its last step already.
-    """
-    left, groups = [], []
-    steps_of = {spec.folder: set(checkpoints.steps(spec.folder)) for spec in specs}
-    for spec in specs:
-        newest = max(steps_of[spec.folder], default=0)
-        if spec.run.finished(spec.steps):
-            continue
-        if newest > spec.steps:
-            raise OffbenchError(f"{spec.folder} is at step {newest} already; give --steps {newest} or more, or --runs")
-        left.append(spec)
-    while left:
-        counts = Counter(step for spec in left for step in steps_of[spec.folder] if step <= spec.steps)
-        # the step that most runs share; among those the newest
-        best = max(counts, key=lambda step: (counts[step], step), default=None)
-        groups.append([spec for spec in left if best is None or best in steps_of[spec.folder]])
-        left = [spec for spec in left if spec not in groups[-1]]
-    return groups
-
-
-def _check_environment(spec: RunSpec, data: Transitions) -> None:
-    """Refuse a run that was evaluated in another environment so far, or in none.
-
-    Other contact margins make another environment.
-    """
-    before = spec.run.config().env_spec
-    if not same_environment(before, data.env_spec):
-        raise OffbenchError(
-            f"{spec.folder} was evaluated in another environment than it would be now "
-            f"({before or 'none'}, not {data.env_spec or 'none'}); give the same --env as before, or {TRAIN_ANEW}"
-        )
-
-
-def _check_evaluations(spec: RunSpec) -> None:
-    """Refuse a run that lacks an evaluation before its newest checkpoint: resuming it would give another score."""
-    newest = max(checkpoints.steps(spec.folder), default=0)
-    last = (newest - 1) // spec.eval_every * spec.eval_every  # the one of `newest` itself may not have finished
-    if last > 0 and last not in spec.run.evaluations():
-        raise OffbenchError(
-            f"{spec.run.evaluations_path} lacks the evaluation of step {last}; put the file back, or delete the "
-            "run to repeat it"
-        )
-
-
-def run_config(spec: RunSpec, data: Transitions, device: str, command: str) -> RunConfig:
-    """Return the config.json of a run that starts now."""
-    return RunConfig(
-        algorithm=spec.algorithm,
-        variant=spec.variant,
-        label=spec.label,
-        settings=settings_json(spec.config),
-        dataset=data.dataset_id,
-        dataset_sha256=data.content,
-        seed=spec.seed,
-        steps=spec.steps,
-        eval_every=spec.eval_every,
-        eval_episodes=spec.eval_episodes,
-        references={"dataset": data.references, "d4rl": d4rl_reference(data.env_spec)},
-        env_id=data.env_id,
-        env_spec=data.env_spec,
-        env_code=environment_code(data.env_spec) if data.env_spec else {},
-        command=command.encode("utf-8", "backslashreplace").decode(),  # a path may hold bytes that are not UTF-8
-        code=code_of(spec.algorithm),
-        **training_platform(device, spec.precision),
-    )

@@ -13,21 +13,20 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
-from types import TracebackType
 
 from offbench.common.errors import OffbenchError
 from offbench.common.interrupts import announce_stop
 from offbench.common.processes import start_worker, uninterrupted_start
 from offbench.common.progress import Progress
 from offbench.common.text import printable
-from offbench.training.devices import arithmetic
-from offbench.training.grouping import load_datasets
-from offbench.training.registry import describe_failure
+from offbench.training.datasets import load_datasets
+from offbench.training.devices import matmul_settings
+from offbench.training.failures import describe_failure
 from offbench.training.spec import Job
-from offbench.training.trainer import STOPPED, Report, Trainer
+from offbench.training.trainer import STOPPED, OnProgress, Trainer
 
 
-def train_job(job: Job, report: Report) -> list[str]:
+def train_job(job: Job, on_progress: OnProgress) -> list[str]:
     """Train a job in this process.
 
     Returns:
@@ -36,8 +35,8 @@ def train_job(job: Job, report: Report) -> list[str]:
     Raises:
         OffbenchError: anything that the user can fix.
     """
-    with arithmetic(job.device, job.first.precision):
-        return Trainer(job, load_datasets(job.specs)).train(report)
+    with matmul_settings(job.device, job.first.precision):
+        return Trainer(job, load_datasets(job.specs)).train(on_progress)
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> list[str]:
@@ -77,24 +76,15 @@ def _titles(jobs: Sequence[Job]) -> list[str]:
     return titles
 
 
-class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
-    """Adds up the jobs' steps for one progress bar."""
+class JobProgress(Progress):
+    """One progress bar for several jobs."""
 
     def __init__(self, jobs: Sequence[Job]) -> None:
         self.jobs, self.steps, self.notes = jobs, dict[int, int](), dict[int, str]()
         self.titles, self.traces = _titles(jobs), {""}
         runs = sum(len(job.specs) for job in jobs)
         title = jobs[0].title if len(jobs) == 1 else f"{runs} runs"
-        self.progress = Progress(sum(job.updates for job in jobs), title, work=sum(job.work for job in jobs))
-
-    def __enter__(self) -> JobProgress:
-        self.progress.__enter__()
-        return self
-
-    def __exit__(
-        self, exception_type: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.progress.__exit__(exception_type, error, trace)
+        super().__init__(sum(job.updates for job in jobs), title, work=sum(job.work for job in jobs))
 
     def report(self, index: int, step: int, note: str) -> None:
         """Show that a job is at `step`, and say where it resumed and where it was stopped.
@@ -102,16 +92,16 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
         It must be called for each of a job's reports.
         """
         if index not in self.steps and step:
-            self.progress.print_line(f"{self.titles[index]}: resuming from step {step:,}")
+            self.print_line(f"{self.titles[index]}: resuming from step {step:,}")
         self.update(index, step, note)
         if note == STOPPED:
-            self.progress.print_line(f"{self.titles[index]}: stopped at step {step:,}, checkpoint saved")
+            self.print_line(f"{self.titles[index]}: stopped at step {step:,}, checkpoint saved")
 
     def update(self, index: int, step: int, note: str) -> None:
         """Show that a job is at `step`."""
         if index not in self.steps:  # steps of an earlier session count as done, not as speed
             done = step * len(self.jobs[index].specs)
-            self.progress.skip(done, done * self.jobs[index].cost)
+            self.skip(done, done * self.jobs[index].cost)
         self.steps[index] = step
         news = "" if note == self.notes.get(index) else note
         self.notes[index] = note
@@ -119,12 +109,12 @@ class JobProgress(contextlib.AbstractContextManager["JobProgress"]):
             news = f"{self.titles[index]}: {news}"
         done_of = {i: step * len(self.jobs[i].specs) for i, step in self.steps.items()}
         work = sum(done * self.jobs[i].cost for i, done in done_of.items())
-        self.progress.to(sum(done_of.values()), news, work)
+        self.to(sum(done_of.values()), news, work)
 
     def print_trace(self, trace: str) -> None:
         """Print a traceback, once if several jobs fail at the same line."""
         if trace not in self.traces:
-            self.progress.print_line(printable(trace.rstrip()))
+            self.print_line(printable(trace.rstrip()))
             self.traces.add(trace)
 
 
@@ -140,7 +130,7 @@ def _train_here(job: Job, index: int, progress: JobProgress) -> list[str]:
 
 
 def _problem(job: Job, error: Exception, write_traceback: Callable[[str], object]) -> str:
-    """Return the line for the failure of one of several jobs."""
+    """Return a line that describes the failure of one of several jobs."""
     return (
         str(error) if isinstance(error, OffbenchError) else f"{job.title}: {describe_failure(error, write_traceback)}"
     )
@@ -210,7 +200,7 @@ def _train_in_processes(jobs: Sequence[Job], processes: int, pool: _Pool) -> Ite
 
 
 def _worker(job: Job, sender: Connection, parent: int) -> None:
-    """Train in a process: send (step, note, None) for each report, then (None, traceback or "", problems)."""
+    """Train in a process: send (step, note, None) at each progress, then (None, traceback or "", problems)."""
     start_worker(parent)
     traces: list[str] = []
     try:

@@ -1,4 +1,4 @@
-"""Live views of training, on request: TensorBoard event files in each run's folder, and Weights & Biases.
+"""Optional loggers: TensorBoard event files in each run's folder, and Weights & Biases.
 
 Both are sent what losses.csv and evaluations.csv hold, and only when a checkpoint is written, so a run that is killed
 and resumed shows every step once. TensorBoard's files are written again when training resumes; the last steps sent to
@@ -27,8 +27,8 @@ Losses = Sequence[Mapping[str, float]]
 
 
 @dataclass(frozen=True)
-class Destinations:
-    """Which live views to write.
+class LoggerOptions:
+    """Which loggers to use.
 
     Attributes:
         tensorboard: event files in each run's folder `tensorboard`.
@@ -46,24 +46,24 @@ class Destinations:
                 raise OffbenchError(f"--{package} needs the package {package}: pip install 'offbench[{package}]'")
 
 
-NO_DESTINATIONS = Destinations()
+NO_LOGGERS = LoggerOptions()
 
 
 class Loggers(contextlib.AbstractContextManager["Loggers"]):
-    """The live views of a job's runs, open while it trains."""
+    """The loggers of a job's runs, open while it trains."""
 
-    def __init__(self, runs: Sequence[Run], destinations: Destinations) -> None:
-        self.runs, self.destinations = list(runs), destinations
-        self.sinks: list[list[TensorBoard | WandB]] = [[] for _ in runs]
+    def __init__(self, runs: Sequence[Run], loggers: LoggerOptions) -> None:
+        self.runs, self.options = list(runs), loggers
+        self.loggers: list[list[TensorBoard | WandB]] = [[] for _ in runs]
         self._closing = contextlib.ExitStack()  # closes all of them, also if one fails
 
     def __enter__(self) -> Loggers:
         with contextlib.ExitStack() as opened:
-            for run, sinks in zip(self.runs, self.sinks, strict=True):
-                if self.destinations.tensorboard:
-                    sinks.append(opened.enter_context(contextlib.closing(TensorBoard(run))))
-                if self.destinations.wandb is not None:
-                    sinks.append(opened.enter_context(contextlib.closing(WandB(run, self.destinations.wandb))))
+            for run, loggers in zip(self.runs, self.loggers, strict=True):
+                if self.options.tensorboard:
+                    loggers.append(opened.enter_context(contextlib.closing(TensorBoard(run))))
+                if self.options.wandb is not None:
+                    loggers.append(opened.enter_context(contextlib.closing(WandB(run, self.options.wandb))))
             self._closing = opened.pop_all()
         return self
 
@@ -71,9 +71,9 @@ class Loggers(contextlib.AbstractContextManager["Loggers"]):
         self._closing.close()
 
     def write(self, index: int, losses: Losses, evaluations: Evaluations) -> None:
-        """Show all rows of the run at `index`."""
-        for sink in self.sinks[index]:
-            sink.write(losses, evaluations)
+        """Send all rows of the run at `index`."""
+        for logger in self.loggers[index]:
+            logger.write(losses, evaluations)
 
 
 class TensorBoard:
@@ -163,7 +163,7 @@ class WandB:
 
 
 def _folder(run: Run, name: str) -> Path:
-    """Return where a live view writes. A link is refused: its files would be written, and deleted, elsewhere."""
+    """Return a logger's folder. A link is refused: its files would be written, and deleted, elsewhere."""
     folder = run.folder / name
     if folder.is_symlink():
         raise OffbenchError(f"{folder} is a link; delete it, so that {name} writes into the run's own folder")

@@ -1,7 +1,7 @@
-"""Algorithms by name: ours and third parties', through the entry-point group `offbench.algos`, and a user's own.
+"""Algorithms by name: those of installed packages, by the entry-point group `offbench.algos`, and a user's own.
 
-A user's own algorithm is a class, or a file `./my_algo.py:ReBRAC`; `register` gives it the name of its class.
-Processes started later find it by that name in $OFFBENCH_OWN_ALGORITHMS, as long as its module can be imported there.
+A user's own algorithm is a class or a file `./my_algo.py:ReBRAC`; `register` gives it the name of its class. Processes
+started later find it by that name in $OFFBENCH_OWN_ALGORITHMS, if its module can be imported there.
 """
 
 from __future__ import annotations
@@ -16,14 +16,12 @@ import os
 import re
 import sys
 import traceback
-import types
 import typing
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, rendering_variable, unknown
-from offbench.common.files import OPEN_FILES, READ_REMEDIES, JsonObject, is_exhausted, is_out_of_memory
+from offbench.common.errors import SHOW_TRACEBACK, OffbenchError, unknown
+from offbench.common.files import is_exhausted
 from offbench.common.settings import check_declarations, fields
 from offbench.common.terminal import warn
 
@@ -31,8 +29,10 @@ if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
 
 GROUP = "offbench.algos"
-OWN_VARIABLE = "OFFBENCH_OWN_ALGORITHMS"  # {name: "module:class"} as JSON, for the processes that this one starts
-_own: dict[str, type[Algorithm]] = {}  # this process's own algorithms
+USER_ALGORITHMS_VARIABLE = (
+    "OFFBENCH_OWN_ALGORITHMS"  # {name: "module:class"} as JSON, for the processes that this one starts
+)
+_user_algorithms: dict[str, type[Algorithm]] = {}  # the user's own, registered in this process
 
 
 # names of the arguments of `train` and of the keys of a grid's entry, which no setting may have
@@ -42,18 +42,6 @@ RESERVED_SETTINGS = {
     "workers",
 }
 REQUIRED_SETTINGS = {"batch_size": int, "normalize": bool}  # settings that the training itself reads
-# Settings of earlier versions, each with the value that has no effect. bdb_plus has some of bdb's
-# now; the others lowered the scores and were removed (docs/results.md).
-REMOVED: JsonObject = {"uncertainty": "absolute", "uncertainty_scale": 1.0, "cloning_steps": 0}
-MOVED: JsonObject = {
-    "beta_max": 1.0,
-    "beta_target": 0.05,
-    "beta_learning_rate": 3e-4,
-    "critic_penalty": "none",
-    "penalty_weight": 1.0,
-    "penalty_actions": 10,
-}
-FORMER_SETTINGS: dict[str, JsonObject] = {"bdb": MOVED | REMOVED, "bdb_plus": REMOVED}
 
 
 @functools.cache
@@ -77,45 +65,10 @@ def algorithm_names() -> list[str]:
     return sorted(_entry_points())
 
 
-def describe_failure(error: Exception, write_traceback: Callable[[str], object] | None = None) -> str:
-    """Return a line that says what went wrong and what to do about it, for any exception.
-
-    Args:
-        write_traceback: receives the traceback (None: it goes to stderr) if $OFFBENCH_TRACEBACK is set, or if the
-            error arose in a third party's algorithm, whose author needs it.
-    """
-    expected = isinstance(error, OffbenchError | OSError) or is_out_of_memory(error)
-    algorithm = None if expected else _third_party(error.__traceback__)
-    if algorithm or os.environ.get("OFFBENCH_TRACEBACK"):
-        (write_traceback or sys.stderr.write)("".join(traceback.format_exception(error)))
-    if isinstance(error, OffbenchError):
-        return str(error)
-    if is_out_of_memory(error):
-        return f"not enough memory ({str(error) or 'for this command'}); close other programs, or ask for less"
-    if isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename else ""
-        remedies = READ_REMEDIES if error.filename else OPEN_FILES
-        remedy = f"; {remedies[error.errno]}" if error.errno in remedies else ""
-        return f"{where}{error.strerror or error}{remedy} ({SHOW_TRACEBACK})"
-    if not algorithm and (variable := rendering_variable(error)):
-        return f"MuJoCo does not load with {variable} ({type(error).__name__}: {error}); unset it or choose another"
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    what = f"{type(error).__name__}: {error} (at {frame.filename}:{frame.lineno})"
-    if algorithm:
-        return f"an error in {algorithm}: {what}; see the traceback above"
-    return f"this is a bug in offbench: {what}; please report it; {SHOW_TRACEBACK}"
-
-
-def _third_party(trace: types.TracebackType | None) -> str | None:
-    """Return the package or module of an algorithm, not offbench's own, that a traceback leads through."""
+def algorithm_packages() -> set[str]:
+    """Return the top-level packages and modules of all algorithms."""
     packages = {point.module.partition(".")[0] for points in _entry_points().values() for point in points}
-    packages |= {cls.__module__.partition(".")[0] for cls in _own.values()} - {"__main__"}
-    while trace is not None:
-        package = str(trace.tb_frame.f_globals.get("__name__", "")).partition(".")[0]
-        if package in packages - {"offbench"}:
-            return package
-        trace = trace.tb_next
-    return None
+    return packages | {cls.__module__.partition(".")[0] for cls in _user_algorithms.values()} - {"__main__"}
 
 
 def load_algorithm(name: str) -> type[Algorithm]:
@@ -126,15 +79,15 @@ def load_algorithm(name: str) -> type[Algorithm]:
     Raises:
         OffbenchError: it is unknown, two packages have one of that name, it does not import, or has no valid Config.
     """
-    if name in _own:
-        return _own[name]
+    if name in _user_algorithms:
+        return _user_algorithms[name]
     points = _entry_points()
     if name not in points:
-        own = json.loads(os.environ.get(OWN_VARIABLE, "{}"))
+        own = json.loads(os.environ.get(USER_ALGORITHMS_VARIABLE, "{}"))
         if name not in own:
             raise unknown("algorithm", name, points)
         module, _, qualname = own[name].partition(":")
-        return _own.setdefault(name, operator.attrgetter(qualname)(importlib.import_module(module)))
+        return _user_algorithms.setdefault(name, operator.attrgetter(qualname)(importlib.import_module(module)))
     point, *others = points[name]
     if others:
         raise OffbenchError(f"two algorithms are named {name!r}: {point.value} and {others[0].value}; rename yours")
@@ -169,25 +122,27 @@ def register(algorithm: str | type) -> str:
     where = algorithm if isinstance(algorithm, str) else f"class {name}"
     if name in _entry_points():
         raise OffbenchError(f"{where}: an algorithm of a package is named {name!r} too; rename the class")
-    other = _own.get(name)
+    other = _user_algorithms.get(name)
     if other is not None and f"{other.__module__}:{other.__qualname__}" != value:
         raise OffbenchError(
             f"two algorithms are named {name!r}, in {other.__module__} and {cls.__module__}; rename one"
         )
-    _own[name] = _check_algorithm(cls, where)
-    if not is_local(name):
-        os.environ[OWN_VARIABLE] = json.dumps(json.loads(os.environ.get(OWN_VARIABLE, "{}")) | {name: value})
+    _user_algorithms[name] = _check_algorithm(cls, where)
+    if not only_in_this_process(name):
+        os.environ[USER_ALGORITHMS_VARIABLE] = json.dumps(
+            json.loads(os.environ.get(USER_ALGORITHMS_VARIABLE, "{}")) | {name: value}
+        )
     return name
 
 
-def own_algorithm(name: str) -> type[Algorithm] | None:
+def user_algorithm(name: str) -> type[Algorithm] | None:
     """Return the class of a user's own algorithm, None for a package's."""
     return load_algorithm(name) if name not in _entry_points() else None
 
 
-def is_local(name: str) -> bool:
+def only_in_this_process(name: str) -> bool:
     """Return whether an algorithm is a class that other processes cannot import: of a notebook, script or function."""
-    cls = _own.get(name)
+    cls = _user_algorithms.get(name)
     return cls is not None and (cls.__module__ == "__main__" or "<locals>" in cls.__qualname__)
 
 
@@ -261,23 +216,3 @@ def _check_algorithm(cls: type, what: str) -> type[Algorithm]:
     if config.__hash__ is None:
         raise OffbenchError(f"{what}: Config must be frozen: @dataclass(frozen=True)")
     return cls
-
-
-def current_settings(algorithm: str, settings: JsonObject, where: str) -> JsonObject:
-    """Return a run's recorded settings without those that its algorithm had in an earlier version only.
-
-    Raises:
-        OffbenchError: one of them had an effect, so that the run can be reported but not resumed or restored.
-    """
-    former = FORMER_SETTINGS.get(algorithm, {})
-    used = {name: settings[name] for name, off in former.items() if settings.get(name, off) != off}
-    if algorithm == "bdb" and settings.get("beta") == "learned":
-        used["beta"] = "learned"
-    if used:
-        name, value = next(iter(used.items()))
-        fate = "was removed" if name in REMOVED else "is a setting of bdb_plus now"
-        raise OffbenchError(
-            f"{where} was trained by an earlier version of {algorithm} with {name} = {value!r}, which {fate}; the run "
-            "can still be reported and evaluated, but not resumed"
-        )
-    return {name: value for name, value in settings.items() if name not in former}

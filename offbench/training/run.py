@@ -36,7 +36,7 @@ from offbench.common.files import (
 from offbench.common.provenance import TrainingPlatform
 from offbench.common.scores import LARGEST_VALUE, Evaluations, check_steps
 from offbench.common.settings import read_back
-from offbench.training.registry import current_settings
+from offbench.training.former_settings import current_settings
 from offbench.training.run_config import FORMAT, RunConfig, Session
 
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")

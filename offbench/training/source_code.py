@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from offbench.common.code_hash import file_hash, imported_files, module_code, package_versions, source_hash
-from offbench.training.registry import load_algorithm, own_algorithm
+from offbench.training.registry import load_algorithm, user_algorithm
 from offbench.training.script_code import script_code
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def _classes(algorithm_class: type[Algorithm]) -> Sequence[type]:
 
 def own_modules(algorithm: str) -> list[types.ModuleType]:
     """Return the modules of a user's own algorithm that no package brings: its file's, and those beside it."""
-    algorithm_class = own_algorithm(algorithm)
+    algorithm_class = user_algorithm(algorithm)
     files: dict[Path, None] = {}
     for cls in _classes(algorithm_class) if algorithm_class else ():
         file = Path(getattr(sys.modules.get(cls.__module__), "__file__", None) or "")

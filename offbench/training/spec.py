@@ -18,19 +18,19 @@ from urllib.parse import quote
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import JsonObject, sha256
 from offbench.common.settings import check, fields, setting, without_numpy
-from offbench.training.loggers import NO_DESTINATIONS, Destinations
+from offbench.training.loggers import NO_LOGGERS, LoggerOptions
 from offbench.training.registry import load_algorithm, register
 from offbench.training.run import Run
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-LONGEST = 255  # bytes of a file's name, on the usual file systems
+MAX_FILE_NAME_BYTES = 255  # on the usual file systems
 
 
 @dataclass(frozen=True)
-class Times:
-    """The seeds of an algorithm's runs, how long each trains and when it is evaluated."""
+class TrainingSchedule:
+    """The seeds of an algorithm's runs, their number of updates, and how often they are evaluated."""
 
     seeds: tuple[int, ...] = (0,)
     steps: int = setting(1_000_000, "updates", low=1)
@@ -43,13 +43,13 @@ class RunSpec:
     """One run that is to be trained.
 
     Attributes:
-        algorithm: its name, as `load_algorithm` takes it.
+        algorithm: the algorithm's name, as `load_algorithm` takes it.
         config: the algorithm's settings, an instance of its `Config`.
         dataset: the id of a local Minari dataset.
         steps: updates of the whole run.
         eval_every, eval_episodes: updates between evaluations, and episodes per evaluation.
         folder: the run's folder.
-        precision: of matrix products.
+        precision: precision of matrix multiplications.
         env_spec: the environment to evaluate in (EnvSpec JSON) instead of the dataset's.
         label: the method's name in tables, empty for the usual one.
     """
@@ -74,10 +74,10 @@ class RunSpec:
     @property
     def variant(self) -> str:
         """The settings that differ from their defaults."""
-        return variant(self.config, self.precision)
+        return variant_name(self.config, self.precision)
 
     @property
-    def times(self) -> tuple[int, int, int]:
+    def schedule(self) -> tuple[int, int, int]:
         """What runs of one job must share in addition to their algorithm: steps, eval_every, eval_episodes."""
         return self.steps, self.eval_every, self.eval_episodes
 
@@ -87,19 +87,19 @@ class Job:
     """A group of runs that train as one program, in one process.
 
     Attributes:
-        specs: the runs; algorithm, times, precision and environment are the same for all.
-        device: PyTorch's name of it.
+        specs: the runs; algorithm, schedule, precision and environment are the same for all.
+        device: PyTorch's name of the device.
         workers: evaluation processes; 0 evaluates in the training process.
         deadline: `time.time()` after which the job stops at the next chunk, with a checkpoint; None for never.
-        destinations: live views of the training.
-        cost: seconds per update of one run, relative to the other jobs, for the time left.
+        loggers: the optional loggers.
+        cost: relative cost of an update of one run; orders the jobs and weights the time left.
     """
 
     specs: tuple[RunSpec, ...]
     device: str
     workers: int = 0
     deadline: float | None = None
-    destinations: Destinations = NO_DESTINATIONS
+    loggers: LoggerOptions = NO_LOGGERS
     cost: float = 1.0
 
     @property
@@ -133,7 +133,7 @@ def specs_of(
     algorithm: str | type,
     settings: Mapping[str, object],
     datasets: Sequence[str],
-    times: Times,
+    schedule: TrainingSchedule,
     runs: Path,
     precision: str = "float32",
     env_spec: str | None = None,
@@ -159,7 +159,7 @@ def specs_of(
             "give each an entry of its own"
         )
     for config in configs:
-        name = variant(config, precision)
+        name = variant_name(config, precision)
         variants.append(
             tuple(
                 RunSpec(
@@ -167,15 +167,15 @@ def specs_of(
                     config,
                     dataset,
                     seed,
-                    times.steps,
-                    times.eval_every,
-                    times.eval_episodes,
+                    schedule.steps,
+                    schedule.eval_every,
+                    schedule.eval_episodes,
                     run_folder(runs, dataset, algorithm, name, seed),
                     precision,
                     env_spec,
                     label,
                 )
-                for dataset, seed in itertools.product(datasets, times.seeds)
+                for dataset, seed in itertools.product(datasets, schedule.seeds)
             )
         )
     return variants
@@ -222,14 +222,14 @@ def run_folder(root: Path, dataset_id: str, algorithm: str, variant: str, seed: 
 
 def folder_name(variant: str) -> str:
     """Return the name of a variant's folder: the variant itself, if a file system takes a name that long."""
-    if len(variant.encode()) <= LONGEST:
+    if len(variant.encode()) <= MAX_FILE_NAME_BYTES:
         return variant
     ending = f"...{sha256(variant.encode())[:16]}"
-    return variant.encode()[: LONGEST - len(ending)].decode(errors="ignore") + ending
+    return variant.encode()[: MAX_FILE_NAME_BYTES - len(ending)].decode(errors="ignore") + ending
 
 
-def variant(config: DataclassInstance, precision: str = "float32") -> str:
-    """Name a config by the settings that differ from their defaults: `default` or `alpha=1,beta=0.5`.
+def variant_name(config: DataclassInstance, precision: str = "float32") -> str:
+    """Return a config's name, from the settings that differ from their defaults: `default` or `alpha=1,beta=0.5`.
 
     A precision other than float32 is the last of them: `beta=0.5,precision=bfloat16`.
     """

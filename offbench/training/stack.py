@@ -87,13 +87,13 @@ class Stack:
             data.low,
             data.high,
             data.env_id,
-            {"step": self.step, **self.origin(run)},
+            {"step": self.step, **self.policy_origin(run)},
             critic=critic,
             samples=parts.samples,
             activation=parts.activation,
         )
 
-    def origin(self, run: int) -> JsonObject:
+    def policy_origin(self, run: int) -> JsonObject:
         """Return a run's algorithm, seed and dataset, for its policy file."""
         spec, data = self.specs[run], self.data[run]
         return {
@@ -103,9 +103,9 @@ class Stack:
             "dataset_sha256": data.content,
         }
 
-    def identity(self, run: int) -> JsonObject:
+    def checkpoint_origin(self, run: int) -> JsonObject:
         """Return a run's algorithm, seed, dataset and settings, for its checkpoints."""
-        return self.origin(run) | settings_json(self.specs[run].config)
+        return self.policy_origin(run) | settings_json(self.specs[run].config)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return everything learned; runs are axis 1 (a step count has none)."""
@@ -121,7 +121,7 @@ class Stack:
 
     def load(self, run: int, tensors: Mapping[str, Tensor], state: JsonObject) -> None:
         """Load one run's checkpoint. Raises OffbenchError if it does not fit, or is of another run."""
-        check_origin(self.specs[run].folder, state, self.identity(run))
+        check_origin(self.specs[run].folder, state, self.checkpoint_origin(run))
         for name, tensor in self.run_tensors(run).items():
             saved = tensors.get(name)
             if saved is None or saved.shape != tensor.shape:
@@ -188,10 +188,10 @@ def slice_of(tensors: Mapping[str, Tensor], run: int) -> dict[str, Tensor]:
     return {name: value if value.dim() == 0 else value[:, run : run + 1] for name, value in tensors.items()}
 
 
-def check_origin(folder: Path, state: JsonObject, identity: JsonObject) -> None:
-    """Raise OffbenchError if a checkpoint's state is of another run or settings than `identity` says."""
+def check_origin(folder: Path, state: JsonObject, expected: JsonObject) -> None:
+    """Raise OffbenchError if a checkpoint belongs to another run, or to other settings."""
     recorded = state.get("origin", {})  # earlier versions wrote none, or not all of it
-    for key, value in identity.items():
+    for key, value in expected.items():
         if (old := recorded.get(key, value)) != value:
             raise OffbenchError(
                 f"the checkpoint in {folder} is of another run: its {key} is {short_repr(old)}, "

@@ -1,32 +1,33 @@
 """`train`: one algorithm on datasets. `Training`: any runs, also those of a grid.
 
-specs -> group -> jobs -> what is left of them (pending) -> run_jobs, or a cluster
+specs -> group -> jobs -> unfinished jobs -> run_jobs, or a cluster
 """
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from offbench.algorithm.interface import Algorithm
-from offbench.common import checkpoints
-from offbench.common.code_hash import changes
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import check_seed
-from offbench.common.settings import build, without_numpy
-from offbench.data import transitions
+from offbench.common.settings import without_numpy
 from offbench.envs.recipes import load_recipe
+from offbench.training.claim import check_folders, claim_unfinished
+from offbench.training.datasets import Datasets, check_datasets, load_datasets
 from offbench.training.devices import Machine, pick_machine
-from offbench.training.grouping import Datasets, check_datasets, check_folders, group, load_datasets, pending
+from offbench.training.grouping import group
 from offbench.training.jobs import raise_first, run_jobs
-from offbench.training.loggers import NO_DESTINATIONS, Destinations
-from offbench.training.registry import algorithm_names, current_settings, is_local, load_algorithm, register
-from offbench.training.run import Run
-from offbench.training.source_code import code_of
-from offbench.training.spec import Job, RunSpec, Times, settings_json, specs_of
-from offbench.training.stack import Stack, check_origin
+from offbench.training.loggers import NO_LOGGERS, LoggerOptions
+from offbench.training.registry import (
+    load_algorithm,
+    only_in_this_process,
+)
+from offbench.training.spec import Job, RunSpec, TrainingSchedule, specs_of
+from offbench.training.stack import Stack
 
 
 def train(
@@ -65,8 +66,8 @@ def train(
         workers: processes for training and evaluation (default: one per core).
         stack: the maximum number of runs trained as one program; "auto" is what fits the memory of a GPU, or 8 on a
             CPU.
-        precision: of matrix products: float32, tf32 (GPUs) or bfloat16 (GPUs, and processors that multiply it
-            natively). Weights, Adam, targets, losses and normalization are float32 in each.
+        precision: precision of matrix multiplications: float32, tf32 (GPUs) or bfloat16 (GPUs, and processors that
+            multiply it natively). Weights, Adam, targets, losses and normalization are always float32.
         runs: the folder of all run folders.
         tensorboard: write TensorBoard event files into each run's folder `tensorboard`.
         wandb: a Weights & Biases project to log the runs to.
@@ -81,11 +82,11 @@ def train(
     Raises:
         OffbenchError: anything that the user can fix, in one line.
     """
-    times = Times(_seed_list(seeds), *map(without_numpy, (steps, eval_every, eval_episodes)))
+    schedule = TrainingSchedule(_seed_list(seeds), *map(without_numpy, (steps, eval_every, eval_episodes)))
     names = [dataset] if isinstance(dataset, str) else list(dict.fromkeys(dataset))
     env_spec = load_recipe(env).env_spec() if env is not None else None
-    variants = specs_of(algorithm, settings, names, times, Path(runs), precision, env_spec)
-    _check_times(times)
+    variants = specs_of(algorithm, settings, names, schedule, Path(runs), precision, env_spec)
+    _check_schedule(schedule)
     if not names:
         raise OffbenchError("give at least one dataset")
     if download:
@@ -93,11 +94,11 @@ def train(
 
         for name in names:
             fetch(name)
-    specs = [spec for name in names for variant in variants for spec in variant if spec.dataset == name]
+    specs = sorted(itertools.chain(*variants), key=lambda spec: names.index(spec.dataset))  # dataset by dataset
     machine = pick_machine(device, workers, stack, precision)
-    destinations = Destinations(tensorboard, wandb)
-    destinations.check()
-    training = Training(specs, machine, command=command, destinations=destinations, fresh=fresh)
+    loggers = LoggerOptions(tensorboard, wandb)
+    loggers.check()
+    training = Training(specs, machine, command=command, loggers=loggers, fresh=fresh)
     if training.finished:
         total = f"{len(specs)} run{'s' if len(specs) > 1 else ''}"
         print(f"already finished: {training.finished} of {total}", file=sys.stderr)
@@ -115,7 +116,7 @@ class Training:
 
     Args:
         command: what the user typed, for config.json.
-        destinations: live views of the training.
+        loggers: the optional loggers.
         fresh: whether to delete what the runs' folders hold first.
 
     Raises:
@@ -128,32 +129,34 @@ class Training:
         machine: Machine,
         *,
         command: str = "",
-        destinations: Destinations = NO_DESTINATIONS,
+        loggers: LoggerOptions = NO_LOGGERS,
         fresh: bool = False,
     ) -> None:
         self.machine, self._command = machine, command
         self._datasets = load_datasets(specs)
         check_datasets(self._datasets)
-        self._groups = [replace(job, destinations=destinations) for job in group(specs, self._datasets, machine)]
+        self._all_jobs = [replace(job, loggers=loggers) for job in group(specs, self._datasets, machine)]
         if fresh:
-            for job in self._groups:  # if the code fails, nothing is deleted
+            for job in self._all_jobs:  # if the code fails, nothing is deleted
                 _try_update(job.first, self._datasets)
             for spec in specs:
                 spec.run.clear()
-        for job in self._groups:
+        for job in self._all_jobs:
             check_folders(job, self._datasets)
-        self.jobs = self.pending()
+        self.jobs = self.unfinished_jobs()
         self.diverged = [
-            f"{spec.folder} has diverged and is not trained further; delete it to repeat it"
-            for job in self._groups
+            f"{spec.folder} diverged earlier and is skipped; delete it to train the run again"
+            for job in self._all_jobs
             for spec in job.specs
             if spec.run.diverged
         ]
         self.finished = len(specs) - len(self.diverged) - sum(len(job.specs) for job in self.jobs)
 
-    def pending(self) -> list[Job]:
+    def unfinished_jobs(self) -> list[Job]:
         """Return what is left to train as the runs' folders are now."""
-        return [left for job in self._groups for left in pending(job, self._datasets, command=self._command)]
+        return [
+            left for job in self._all_jobs for left in claim_unfinished(job, self._datasets, command=self._command)
+        ]
 
     def run(
         self,
@@ -174,12 +177,12 @@ class Training:
         """
         jobs = [replace(job, deadline=deadline, cost=(cost or {}).get(job.first.algorithm, 1.0)) for job in self.jobs]
         jobs.sort(key=lambda job: -job.work)  # a long job that starts last would leave other processes idle
-        local = any(is_local(job.first.algorithm) for job in jobs)  # other processes cannot import the class
+        local = any(only_in_this_process(job.first.algorithm) for job in jobs)
         return execute(jobs, 1 if local else self.machine.processes) if jobs else []
 
 
 def _try_update(spec: RunSpec, datasets: Datasets) -> None:
-    """Do the first update of a run on the CPU, to check that its code works; its result is discarded."""
+    """Perform the first update of a run on the CPU, to check that its code works; discard the result."""
     stack = Stack(load_algorithm(spec.algorithm), [spec], {spec.dataset: datasets[spec.dataset]}, "cpu")
     for _ in stack.train(1):
         pass
@@ -189,50 +192,10 @@ def _seed_list(seeds: int | Sequence[int]) -> tuple[int, ...]:
     return tuple(map(check_seed, seeds if isinstance(seeds, Iterable) else [seeds]))
 
 
-def _check_times(times: Times) -> None:
-    if not times.seeds or len(set(times.seeds)) < len(times.seeds):
-        raise OffbenchError(f"seeds must be different whole numbers, not {list(times.seeds)}")
+def _check_schedule(schedule: TrainingSchedule) -> None:
+    if not schedule.seeds or len(set(schedule.seeds)) < len(schedule.seeds):
+        raise OffbenchError(f"seeds must be different whole numbers, not {list(schedule.seeds)}")
     for name in ("steps", "eval_every", "eval_episodes"):
-        value = getattr(times, name)
+        value = getattr(schedule, name)
         if not isinstance(value, int) or value < 1:
             raise OffbenchError(f"{name} must be a whole number from 1, not {value}")
-
-
-def restore(run: Run, algorithm: str | type | None = None) -> Stack:
-    """Return a run's learning state from its newest checkpoint, on the CPU.
-
-    Args:
-        algorithm: the run's algorithm, if no installed package has it: `./my_algo.py:ReBRAC`, or the class.
-
-    Raises:
-        OffbenchError: no run, no checkpoint, its dataset is gone or changed, or its algorithm is another or unknown.
-    """
-    config = run.config()
-    if algorithm is not None and register(algorithm) != config.algorithm:
-        raise OffbenchError(f"{run.folder} is a run of {config.algorithm}, not of {register(algorithm)}")
-    try:
-        algorithm_class = load_algorithm(config.algorithm)
-    except OffbenchError as error:
-        if config.algorithm in algorithm_names():
-            raise
-        raise OffbenchError(f"{error}; for a file of your own, give --algorithm ./FILE.py:CLASS") from None
-    recorded = current_settings(config.algorithm, config.settings, str(run.folder))
-    if changed := changes(config.code, code_of(config.algorithm)):
-        raise OffbenchError(
-            f"{run.folder} was trained by other code of {config.algorithm}: {changed}; restore it, or train again"
-        )
-    settings = build(algorithm_class.Config, recorded, f"{run.config_path}: settings")
-    data = transitions.load(config.dataset)
-    if data.content != config.dataset_sha256:
-        raise OffbenchError(f"{data.dataset_id} is no longer the dataset that {run.folder} was trained on")
-    newest = checkpoints.load_newest(run.folder)
-    if newest is None:
-        raise OffbenchError(f"{run.folder} has no checkpoint yet; train it to its first one")
-    tensors, state = newest
-    times = config.steps, config.eval_every, config.eval_episodes
-    check_origin(run.folder, state, settings_json(settings))  # before networks of that size are made
-    spec = RunSpec(config.algorithm, settings, config.dataset, config.seed, *times, run.folder)
-    stack = Stack(algorithm_class, [spec], {config.dataset: data}, "cpu")
-    stack.load(0, tensors, state)
-    stack.step = int(state["step"])
-    return stack

@@ -26,7 +26,7 @@ from offbench.common.seeds import Purpose
 from offbench.common.terminal import inform
 from offbench.data.transitions import Transitions
 from offbench.rollouts.rollouts import EpisodeStats, Rollouts, gathered
-from offbench.training.grouping import run_config
+from offbench.training.claim import new_run_config
 from offbench.training.loggers import Loggers
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run
@@ -39,7 +39,7 @@ SLOW_SAVE_SHARE = 0.05  # largest share of the time spent on slow checkpoints
 
 STOPPED = "stopped with a checkpoint"  # the last note of a training that was interrupted
 
-Report = Callable[[int, str], None]  # takes the step and a note such as the last score
+OnProgress = Callable[[int, str], None]  # takes the step and a note such as the last score
 
 
 class Trainer:
@@ -54,10 +54,12 @@ class Trainer:
         self.runs: list[Run] = [spec.run for spec in job.specs]
         self.platform = training_platform(job.device, job.first.precision)
         self.stack = Stack(load_algorithm(job.first.algorithm), job.specs, datasets, job.device)
-        self.loggers = Loggers(self.runs, job.destinations)
+        self.loggers = Loggers(self.runs, job.loggers)
         self.evaluations: list[dict[int, list[tuple[float, int]]]] = [{} for _ in self.runs]
         self.losses: list[list[dict[str, float]]] = [[] for _ in self.runs]
-        self.pending: list[tuple[int, int, list[Future[list[EpisodeStats]]]]] = []  # (run, step, episodes) under way
+        self.pending: list[
+            tuple[int, int, list[Future[list[EpisodeStats]]]]
+        ] = []  # (run, step, episodes) being played
         self.rollouts: Rollouts | None = None
         self.note = ""
         self.diverged: dict[int, str] = {}  # runs that have diverged, and the message for the user
@@ -65,14 +67,14 @@ class Trainer:
         self.stops: list[int] = []  # signals received: Ctrl-C and SIGTERM
         self._saved, self._save_seconds = time.monotonic(), 0.0  # when the last checkpoint was written, and how fast
 
-    def train(self, report: Report) -> list[str]:
+    def train(self, on_progress: OnProgress) -> list[str]:
         """Train from the newest step that all runs have a checkpoint of, to the last one or the deadline.
 
         Returns:
             A line for each run that has diverged.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C, or whatever SIGTERM does, once a checkpoint is written.
+            KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is written.
         """
         steps = self.job.first.steps
         with contextlib.ExitStack() as resources:
@@ -80,7 +82,7 @@ class Trainer:
             for run in self.runs:
                 resources.enter_context(run.locked())
             for run, spec, data in zip(self.runs, self.job.specs, self.stack.data, strict=True):
-                run.check_claimed(run_config(spec, data, self.job.device, ""))
+                run.check_claimed(new_run_config(spec, data, self.job.device, ""))
             self._resume()
             for run in self.runs:
                 if self.stack.step:
@@ -91,26 +93,26 @@ class Trainer:
             env_spec = self.stack.data[0].env_spec  # datasets of one stack are of one environment
             if env_spec:
                 self.rollouts = resources.enter_context(Rollouts(env_spec, self.job.workers))
-            report(self.stack.step, "")
+            on_progress(self.stack.step, "")
             if self._evaluates_at(self.stack.step) and self.stack.step:
-                self._evaluate()
+                self._start_evaluations()
             while self.stack.step < steps and len(self.diverged) < len(self.runs):
-                in_time = self._train_to(self._next_stop(), report)
+                in_time = self._train_to(self._next_evaluation(), on_progress)
                 self._mark_diverged()
-                self._collect()  # evaluations of earlier steps are written first, so a resume misses none
+                self._finish_evaluations()  # evaluations of earlier steps are written first, so a resume misses none
                 if self.stack.step and (not in_time or self.stack.step == steps or self._checkpoint_is_due()):
                     self._checkpoint()
                 if not in_time:
                     break
                 if self._evaluates_at(self.stack.step):
-                    self._evaluate()
-            self._collect()
-            self._show()
+                    self._start_evaluations()
+            self._finish_evaluations()
+            self._write_loggers()
             saved = self.stops and self.stack.step and any(self._active())
-            report(self.stack.step, STOPPED if saved else self.note)
+            on_progress(self.stack.step, STOPPED if saved else self.note)
         return list(self.diverged.values())
 
-    def _train_to(self, stop: int, report: Report) -> bool:
+    def _train_to(self, stop: int, on_progress: OnProgress) -> bool:
         """Train up to `stop`; return False if the deadline, Ctrl-C or SIGTERM came first."""
         if self.stops:
             return False
@@ -120,8 +122,8 @@ class Trainer:
                 for rows, row in zip(self.losses, self.stack.captured_update.logged(), strict=True):
                     rows.append({"step": step, **row})
             if self.pending and all(future.done() for *_, futures in self.pending for future in futures):
-                self._collect()
-            report(step, self.note)
+                self._finish_evaluations()
+            on_progress(step, self.note)
             if late or self.stops:
                 return False
         return True
@@ -131,7 +133,7 @@ class Trainer:
         return self._save_seconds < QUICK_SAVE or time.monotonic() - self._saved > self._save_seconds / SLOW_SAVE_SHARE
 
     def _mark_diverged(self) -> None:
-        """Leave out the runs that hold NaN or infinity: their files stay as their last checkpoint left them."""
+        """Leave out the runs that contain NaN or infinity; their files stay as of their last checkpoint."""
         for i, tensor in self.stack.diverged().items():
             if i not in self.diverged:
                 run, step = self.runs[i], self.stack.step
@@ -144,8 +146,8 @@ class Trainer:
         """Yield the runs that have not diverged, with their index."""
         return ((i, run) for i, run in enumerate(self.runs) if i not in self.diverged)
 
-    def _next_stop(self) -> int:
-        """Return the next step with a checkpoint: every evaluation, and the end."""
+    def _next_evaluation(self) -> int:
+        """Return the next step at which an evaluation is due, at most the last step."""
         every = self.job.first.eval_every
         return min(self.job.first.steps, (self.stack.step // every + 1) * every)
 
@@ -187,13 +189,13 @@ class Trainer:
                 run.write_evaluations(self.evaluations[i])
                 run.write_losses(self.losses[i])
                 self.stack.policy(i).save(run.policy_path)
-                state: JsonObject = {"step": step, "origin": self.stack.identity(i)}
+                state: JsonObject = {"step": step, "origin": self.stack.checkpoint_origin(i)}
                 unlogged = self.stack.captured_update.unlogged(i)
                 if unlogged:  # stopped between two rows of losses.csv
                     state["unlogged"] = unlogged
                 checkpoints.save_checkpoint(run.folder, step, slice_of(tensors, i), state)
                 checkpoints.keep_newest(run.folder, step)
-        self._show()
+        self._write_loggers()
         self._saved = time.monotonic()
         self._save_seconds = self._saved - began
 
@@ -209,12 +211,12 @@ class Trainer:
             "last checkpoint"
         )
 
-    def _show(self) -> None:
-        """Send what the last checkpoint keeps to the live views."""
+    def _write_loggers(self) -> None:
+        """Send what the last checkpoint keeps to the loggers."""
         for i, _ in self._active():
             self.loggers.write(i, self.losses[i], self.evaluations[i])
 
-    def _evaluate(self) -> None:
+    def _start_evaluations(self) -> None:
         """Start the evaluation of every run's policy at this step, unless there is one already."""
         step = self.stack.step
         if self.rollouts is None:
@@ -229,8 +231,8 @@ class Trainer:
                     (i, step, self.rollouts.start_evaluation(policy, spec.seed, stream, spec.eval_episodes, True))
                 )
 
-    def _collect(self) -> None:
-        """Wait for all evaluations under way and write them to the runs' files."""
+    def _finish_evaluations(self) -> None:
+        """Wait for all evaluations that are running, and write them to the runs' files."""
         for i, step, futures in self.pending:
             self.evaluations[i][step] = [(episode.ret, episode.length) for episode in gathered(futures)]
             self.runs[i].write_evaluations(self.evaluations[i])

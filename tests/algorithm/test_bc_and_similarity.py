@@ -16,8 +16,8 @@ from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.evaluation.similarity import similarity
 from offbench.rollouts.policy import load_policy
+from offbench.training.restore import restore
 from offbench.training.run import Run
-from offbench.training.train import restore
 from tests.data.test_transitions import episode, foreign
 
 SMALL: dict[str, Any] = {"hidden": (32, 32), "batch_size": 64, "eval_every": 500, "eval_episodes": 2}

@@ -17,7 +17,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.settings import build, setting
 from offbench.envs.recipes import load_recipe
 from offbench.training import captured_update
-from offbench.training.devices import arithmetic
+from offbench.training.devices import matmul_settings
 from offbench.training.registry import load_algorithm
 from offbench.training.stack import Stack
 
@@ -63,7 +63,7 @@ def test_a_replayed_update_has_the_bits_of_an_eager_one(
     kind = load_algorithm(algorithm)
     replayed, eager = (stack_of(kind, runs, **(SMALL | settings)) for _ in range(2))
     eager.captured_update.eager = True
-    with arithmetic("cpu", precision):
+    with matmul_settings("cpu", precision):
         ours, theirs = trained(replayed, 60), trained(eager, 60)
     assert not replayed.captured_update.eager
     assert replayed.captured_update._traces

@@ -18,7 +18,7 @@ from offbench.algorithm.interface import Distribution
 from offbench.common.errors import OffbenchError
 from offbench.training import registry
 from offbench.training.registry import algorithm_names, load_algorithm
-from offbench.training.spec import Times
+from offbench.training.spec import TrainingSchedule
 from tests.cli.test_bad_input import refusal
 
 
@@ -234,7 +234,7 @@ def test_two_algorithms_of_one_name_are_refused(monkeypatch: pytest.MonkeyPatch)
 def test_every_option_of_train_is_reserved() -> None:
     """A setting of its name could not be given."""
     options = set(inspect.signature(offbench.train).parameters) - {"settings"}
-    entry = {"name", "label", "datasets", *(field.name for field in dataclasses.fields(Times))}
+    entry = {"name", "label", "datasets", *(field.name for field in dataclasses.fields(TrainingSchedule))}
     assert options | entry | {"help"} <= registry.RESERVED_SETTINGS
     for name in algorithm_names():
         assert not registry.RESERVED_SETTINGS & {f.name for f in dataclasses.fields(load_algorithm(name).Config)}

@@ -78,7 +78,7 @@ def test_the_papers_grid_is_its_table() -> None:
     """15 datasets x (TD3+BC, CQL, four BDB) x 5 seeds = 450 runs of a million updates."""
     bench = prepare("paper", workers=1)
     assert sum(map(len, bench.variants)) == 450
-    assert {spec.times for specs in bench.variants for spec in specs} == {(1_000_000, 5_000, 10)}
+    assert {spec.schedule for specs in bench.variants for spec in specs} == {(1_000_000, 5_000, 10)}
     bdb = [f"bdb ({beta})" for beta in ("beta=0.25", "beta=0.5", "beta=0.75", "adaptive")]
     assert [line.partition("  75 runs")[0].strip() for line in list(Plan(bench))[1:7]] == [
         "td3_bc",

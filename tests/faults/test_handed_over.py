@@ -21,7 +21,7 @@ from offbench.common.settings import setting
 from offbench.data import minari_store, transitions
 from offbench.envs.environments import make_env, untrusted_env
 from offbench.evaluation.similarity import read_similarity
-from offbench.training.spec import variant
+from offbench.training.spec import variant_name
 from tests.faults.test_integrity import trained
 
 SMALL: dict[str, Any] = {"eval_every": 50, "eval_episodes": 1, "workers": 1, "hidden": (8, 8), "batch_size": 16}
@@ -190,11 +190,13 @@ def test_variants_keep_every_digit_and_letter() -> None:
         mode: str = setting("a", "")
 
     names = [
-        variant(Config(rate, mode)) for rate in (0.00012345678, 0.00012345679) for mode in ("B", "b", "x/y", "x,y")
+        variant_name(Config(rate, mode))
+        for rate in (0.00012345678, 0.00012345679)
+        for mode in ("B", "b", "x/y", "x,y")
     ]
     assert len({name.lower() if "mode=b" not in name.lower() else name for name in names}) == 8
     assert not any("/" in name for name in names)
-    assert variant(Config(0.0003)) == "rate=0.0003"  # as ever
+    assert variant_name(Config(0.0003)) == "rate=0.0003"  # as ever
 
 
 def test_a_setting_of_texts_is_one_folder_name() -> None:
@@ -202,7 +204,7 @@ def test_a_setting_of_texts_is_one_folder_name() -> None:
     class Config:
         parts: tuple[str, ...] = setting((), "")
 
-    names = [variant(Config(parts)) for parts in (("a", "b"), ("axb",), ("a/../../b",), ("a,b",))]
+    names = [variant_name(Config(parts)) for parts in (("a", "b"), ("axb",), ("a/../../b",), ("a,b",))]
     assert names == ["parts=axb", "parts=a%78b", "parts=a%2F..%2F..%2Fb", "parts=a%2Cb"]
 
 

@@ -17,7 +17,8 @@ from offbench.common.files import write_json
 from offbench.common.settings import fields
 from offbench.evaluation.similarity import similarity
 from offbench.reports.tables import published
-from offbench.training.registry import MOVED, load_algorithm
+from offbench.training.former_settings import MOVED
+from offbench.training.registry import load_algorithm
 from tests.made_runs import METHODS, made_grid, made_run
 from tests.pages import Page, rows
 

@@ -25,7 +25,7 @@ from offbench.common.provenance import versions
 from offbench.common.settings import build
 from offbench.common.tables import markdown
 from offbench.envs.recipes import load_recipe
-from offbench.training.devices import PRECISIONS, arithmetic, pick_device
+from offbench.training.devices import PRECISIONS, matmul_settings, pick_device
 from offbench.training.registry import load_algorithm
 from offbench.training.stack import Stack
 
@@ -57,7 +57,7 @@ def rate(algorithm: str, runs: int, device: str, *, captured: bool, precision: s
         gc.collect()  # of the stack before, which has reference cycles
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-    with arithmetic(device, precision):
+    with matmul_settings(device, precision):
         stack = stack_of(algorithm, runs, device, captured=captured)
         advance(stack, 100)
         done, began = 0, time.perf_counter()
@@ -78,7 +78,7 @@ def advance(stack: Stack, updates: int) -> int:
 
 def equality(algorithm: str, device: str) -> dict[str, float]:
     """Return the largest difference of the weights after 50 updates: captured against plain, stack against alone."""
-    with arithmetic(device):
+    with matmul_settings(device):
         stacks = [
             stack_of(algorithm, 5, device),
             stack_of(algorithm, 5, device, captured=False),

@@ -43,10 +43,10 @@ def stack_of(
     from offbench.benchmarks.throughput import random_stack
     from offbench.common.settings import build
     from offbench.envs.recipes import load_recipe
-    from offbench.training.devices import arithmetic
+    from offbench.training.devices import matmul_settings
     from offbench.training.registry import load_algorithm
 
-    ARITHMETIC.enter_context(arithmetic("cpu", precision))
+    ARITHMETIC.enter_context(matmul_settings("cpu", precision))
     kind = load_algorithm(algorithm)
     config: Any = build(kind.Config, {"hidden": hidden} | ({"bc_steps": 0} if algorithm == "cql" else {}), algorithm)
     return random_stack(kind, [config] * runs, load_recipe(ENV).env_spec(), rows=rows)

@@ -19,7 +19,7 @@ from offbench.benchmarks.throughput import random_stack
 from offbench.common.provenance import hardware
 from offbench.common.settings import build
 from offbench.envs.recipes import load_recipe
-from offbench.training.devices import arithmetic
+from offbench.training.devices import matmul_settings
 from offbench.training.registry import load_algorithm
 
 STORED = Path(__file__).parent.parent / "fixtures" / "earlier" / "variants.safetensors"
@@ -53,7 +53,7 @@ def learned(case: str) -> dict[str, Tensor]:
     small = SMALL | ({"discriminator_hidden": (8, 8)} if algorithm.startswith("bdb") else {})
     config = build(kind.Config, small | settings, case)
     stack = random_stack(kind, [config, config], load_recipe("hopper").env_spec())
-    with arithmetic("cpu"):
+    with matmul_settings("cpu"):
         for _ in stack.train(UPDATES):
             pass
     return {name: tensor.detach().clone() for name, tensor in stack.tensors().items() if name.endswith("flat")}

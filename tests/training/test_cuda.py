@@ -12,7 +12,7 @@ from torch import Tensor
 
 import offbench
 from offbench.training.batches import draw_chunk
-from offbench.training.devices import PRECISIONS, arithmetic
+from offbench.training.devices import PRECISIONS, matmul_settings
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run
 from offbench.training.stack import Stack
@@ -59,7 +59,7 @@ def cpu_draws(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_gpu_learns_what_the_cpu_does(algorithm: str, settings: dict[str, str], cpu_draws: None) -> None:
     found = []
     for device in ("cuda", "cpu"):
-        with arithmetic(device):
+        with matmul_settings(device):
             found.append(trained(stack_on(device, algorithm, settings), UPDATES))
     assert_same_learning(found[0], found[1], tolerance=1e-3)
 
@@ -69,7 +69,7 @@ def test_a_gpu_learns_what_the_cpu_does(algorithm: str, settings: dict[str, str]
 def test_a_captured_update_equals_a_plain_one(algorithm: str, settings: dict[str, str], precision: str) -> None:
     captured, plain = (stack_on("cuda", algorithm, settings) for _ in range(2))
     plain.captured_update.eager = True
-    with arithmetic("cuda", precision):
+    with matmul_settings("cuda", precision):
         ours, theirs = trained(captured, UPDATES), trained(plain, UPDATES)
     assert captured.captured_update._graphs
     assert not plain.captured_update._graphs
@@ -78,7 +78,7 @@ def test_a_captured_update_equals_a_plain_one(algorithm: str, settings: dict[str
 
 @pytest.mark.parametrize(("algorithm", "settings"), CASES)
 def test_a_run_is_the_same_alone_and_in_a_stack(algorithm: str, settings: dict[str, str]) -> None:
-    with arithmetic("cuda"):
+    with matmul_settings("cuda"):
         alone, stack = (trained(stack_on("cuda", algorithm, settings, runs), UPDATES) for runs in (1, 3))
     first = {name: value[:, :1] if value.dim() else value for name, value in stack[0].items()}
     assert_same_learning((first, stack[1][:1]), alone, tolerance=1e-3)
@@ -88,9 +88,9 @@ def test_a_run_is_the_same_alone_and_in_a_stack(algorithm: str, settings: dict[s
 
 @pytest.mark.parametrize("precision", ["tf32", "bfloat16"])
 def test_a_precision_rounds_products_and_nothing_else(precision: str) -> None:
-    with arithmetic("cuda"):
+    with matmul_settings("cuda"):
         exact = trained(stack_on("cuda", "td3_bc", {"hidden": "128,128"}), UPDATES)
-    with arithmetic("cuda", precision):
+    with matmul_settings("cuda", precision):
         rounded = trained(stack_on("cuda", "td3_bc", {"hidden": "128,128"}), UPDATES)
     assert all(tensor.dtype in (torch.float32, torch.int64) for tensor in rounded[0].values())
     assert any(not torch.equal(rounded[0][name], exact[0][name]) for name in exact[0])

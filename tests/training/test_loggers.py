@@ -19,7 +19,7 @@ import pytest
 import offbench
 from offbench.cli.main import main
 from offbench.training import loggers
-from offbench.training.loggers import Destinations, Loggers
+from offbench.training.loggers import LoggerOptions, Loggers
 from offbench.training.run import Run
 from tests.made_runs import made_run
 
@@ -139,7 +139,7 @@ def show(run: Run, until: int) -> None:
     """Show a run as it was when it had reached `until`, in a process of its own so to speak."""
     losses = [row for row in run.losses() if row["step"] <= until]
     evaluations = {step: rows for step, rows in run.evaluations().items() if step < until}
-    with Loggers([run], Destinations(wandb="project")) as views:
+    with Loggers([run], LoggerOptions(wandb="project")) as views:
         views.write(0, losses, evaluations)
 
 
@@ -190,7 +190,7 @@ def test_a_refusal_at_the_second_run_closes_the_first(
     runs = [made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", seed, 50) for seed in range(2)]
     with (
         pytest.raises(offbench.OffbenchError, match="too many runs"),
-        Loggers(runs, Destinations(wandb="project")),
+        Loggers(runs, LoggerOptions(wandb="project")),
     ):
         pass
     assert fake_wandb[0].finished
@@ -204,7 +204,7 @@ def test_a_run_that_does_not_close_leaves_no_other_open(
 
     monkeypatch.setattr(loggers.TensorBoard, "close", full)
     runs = [made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", seed, 50) for seed in range(2)]
-    with pytest.raises(OSError, match="disk full"), Loggers(runs, Destinations(tensorboard=True, wandb="project")):
+    with pytest.raises(OSError, match="disk full"), Loggers(runs, LoggerOptions(tensorboard=True, wandb="project")):
         pass
     assert [run.finished for run in fake_wandb] == [True, True]
 
@@ -217,7 +217,7 @@ def test_a_run_whose_folder_of_events_is_a_link(name: str, home: Path, fake_wand
     (home / "elsewhere" / "events.out.tfevents.1").touch()
     run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
     (run.folder / name).symlink_to(home / "elsewhere")
-    show = Destinations(tensorboard=True) if name == "tensorboard" else Destinations(wandb="project")
+    show = LoggerOptions(tensorboard=True) if name == "tensorboard" else LoggerOptions(wandb="project")
     with pytest.raises(offbench.OffbenchError, match=f"{name} is a link; delete it"), Loggers([run], show):
         pass
     assert os.listdir(home / "elsewhere") == ["events.out.tfevents.1"]

@@ -22,9 +22,9 @@ from offbench.common.code_hash import changes
 from offbench.common.errors import OffbenchError
 from offbench.reports.tables import score_table
 from offbench.training import registry, source_code
+from offbench.training.restore import restore
 from offbench.training.run import Run
 from offbench.training.source_code import code_of
-from offbench.training.train import restore
 from tests.cli.test_bad_input import refusal
 from tests.conftest import ROOT, forget_modules
 from tests.made_runs import made_run
@@ -44,7 +44,7 @@ def _alone(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def again(home: Path) -> None:
     """Forget what a process knows of own algorithms, as a new process does."""
-    registry._own.clear()
+    registry._user_algorithms.clear()
     source_code._codes.clear()
     forget_modules(home)
     shutil.rmtree(home / "__pycache__", ignore_errors=True)

@@ -65,7 +65,7 @@ def of_script(home: Path, script: str, half: str = "HALF = 0.5\n") -> dict[str, 
     (home / "script.py").write_text(script)
     (home / "helper.py").write_text(HELPER)
     (home / "parts.py").write_text(half)
-    registry._own.clear()
+    registry._user_algorithms.clear()
     for name in ("helper", "parts"):
         sys.modules.pop(name, None)
     code: dict[str, str] = runpy.run_path("script.py", run_name="__main__")["code"]
@@ -118,7 +118,7 @@ def test_an_edited_cell_of_a_notebook_is_noticed(home: Path, medium: str, monkey
 
     def train(cell: str, steps: int = 20) -> None:
         exec(cell, vars(notebook))
-        registry._own.clear()
+        registry._user_algorithms.clear()
         small = {"hidden": (8,), "batch_size": 8, "eval_every": 10, "eval_episodes": 1, "workers": 1}
         offbench.train(vars(notebook)["Mine"], medium, steps=steps, **small)
 

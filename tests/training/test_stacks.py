@@ -197,7 +197,7 @@ def test_each_run_of_a_stack_has_the_mean_of_its_own_updates(medium: str) -> Non
 
 def test_an_ensemble_of_numbers_is_checked_for_nan(medium: str) -> None:
     """A learned part may have tensors [ensemble, runs], without further axes."""
-    from offbench.training.grouping import load_datasets
+    from offbench.training.datasets import load_datasets
     from offbench.training.stack import Stack
 
     stack_specs = specs(medium, "runs", 2, (10, 10))
