@@ -131,11 +131,11 @@ print("script runs")
 import numpy as np
 from offbench.envs.environments import env_spec
 from offbench.rollouts.policy import uniform
-from offbench.rollouts.rollouts import Rollouts, gathered
+from offbench.rollouts.rollouts import Rollouts, gather
 
 with Rollouts(env_spec("InvertedPendulum-v5"), workers=1) as rollouts:
     policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
-    print(len(gathered(rollouts.start_evaluation(policy, 0, (), 3, True))), "episodes")
+    print(len(gather(rollouts.start_evaluation(policy, 0, (), 3, True))), "episodes")
     loaded = "set(__import__('sys').modules) & {'torch', 'stable_baselines3'}"
     print("worker has", list(rollouts._pool.submit(eval, loaded).result()))
 """

@@ -41,7 +41,7 @@ from offbench.common.terminal import inform
 from offbench.envs.environments import make_env, spaces_of
 from offbench.envs.recipes import Recipe
 from offbench.rollouts.policy import Policy, load_policy, uniform
-from offbench.rollouts.rollouts import MEASURES, EpisodeStats, Rollouts, gathered, summary
+from offbench.rollouts.rollouts import MEASURES, EpisodeStats, Rollouts, summary
 
 EXPERT_CANDIDATES = 8  # late rungs measured to choose the expert
 MOST_MEASURED = 6  # policies measured to find the one nearest a return
@@ -122,7 +122,7 @@ class RungEvaluator:
         self, policy: Policy, stream: tuple[int, ...], count: int, deterministic: bool = False
     ) -> list[EpisodeStats]:
         """Play evaluation episodes."""
-        return gathered(self.rollouts.start_evaluation(policy, self.folder.seed, stream, count, deterministic))
+        return self.rollouts.evaluate(policy, self.folder.seed, stream, count, deterministic)
 
     def estimate(self, step: int) -> float:
         """Return the return of a policy, as measured, or as screened if it was not measured."""
@@ -281,7 +281,7 @@ def random_reference(recipe: Recipe, seed: int, rollouts: Rollouts) -> dict[str,
     observations, actions = spaces_of(make_env(recipe.env_spec()), recipe.env_id)
     policy = uniform(actions.low, actions.high, observations.shape[0], recipe.env_id)
     episodes = recipe.measure.reference_episodes
-    episode_stats = gathered(rollouts.start_evaluation(policy, seed, (int(Purpose.REFERENCE), 0), episodes, False))
+    episode_stats = rollouts.evaluate(policy, seed, (int(Purpose.REFERENCE), 0), episodes, False)
     return summary(episode_stats) | {"episodes": episodes}
 
 

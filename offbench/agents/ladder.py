@@ -240,12 +240,12 @@ def _warn_other_recipe(ladder: Ladder, recipe: Recipe) -> None:
         )
 
 
-def shipped_references(spec: str) -> tuple[float, float] | None:
+def shipped_references(env_spec: str) -> tuple[float, float] | None:
     """Return the (random, expert) returns shipped for an environment (EnvSpec JSON); None if none are shipped."""
     for name in names():
         recipe = load_recipe(name)
         # the id first: making the spec of every recipe takes a while
-        if recipe.env_id != json.loads(spec).get("id") or not same_environment(recipe.env_spec(), spec):
+        if recipe.env_id != json.loads(env_spec).get("id") or not same_environment(recipe.env_spec(), env_spec):
             continue
         if ladder := shipped_ladder(recipe):
             return ladder.random_return, ladder.expert_return

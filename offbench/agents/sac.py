@@ -55,7 +55,7 @@ from offbench.envs.environments import Env, make_env
 from offbench.envs.margin_rule import EARLIER
 from offbench.envs.recipes import Recipe, SACSettings
 from offbench.rollouts.policy import Policy
-from offbench.rollouts.rollouts import MEASURES, ErrorReporting, Rollouts, gathered, summary
+from offbench.rollouts.rollouts import MEASURES, ErrorReporting, Rollouts, summary
 
 RUNG_COLUMNS = (
     "step",
@@ -177,11 +177,11 @@ def _plan(recipe: Recipe, step_seconds: float, first: int, steps: int) -> str:
     )
 
 
-def _measure_gradient_step(recipe: Recipe, spec: str) -> float:
+def _measure_gradient_step(recipe: Recipe, env_spec: str) -> float:
     """Return the seconds of a gradient step of this recipe, measured on a new model with its environment steps."""
     settings = dataclasses.replace(recipe.sac, learning_starts=0)
     cycle = settings.cycle()[0] * settings.envs
-    model = _make_sac(dataclasses.replace(recipe, sac=settings), spec, (WARM_UP + PROBE_CYCLES) * cycle)
+    model = _make_sac(dataclasses.replace(recipe, sac=settings), env_spec, (WARM_UP + PROBE_CYCLES) * cycle)
     model.learn(WARM_UP * cycle, log_interval=sys.maxsize)
     start, first = time.monotonic(), model.num_timesteps
     while time.monotonic() - start < PROBE and model.num_timesteps < (WARM_UP + PROBE_CYCLES) * cycle:
@@ -192,7 +192,7 @@ def _measure_gradient_step(recipe: Recipe, spec: str) -> float:
     return (time.monotonic() - start) / done
 
 
-def _make_sac(recipe: Recipe, spec: str, buffer_size: int) -> SAC:
+def _make_sac(recipe: Recipe, env_spec: str, buffer_size: int) -> SAC:
     settings = recipe.sac
     cycle, gradient_steps = settings.cycle()
 
@@ -200,7 +200,7 @@ def _make_sac(recipe: Recipe, spec: str, buffer_size: int) -> SAC:
         # float32 halves the replay buffer; the medium-replay level keeps exactly what SAC saw
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # Gymnasium's remark on the bounds' precision
-            return gym.wrappers.DtypeObservation(ErrorReporting(make_env(spec)), np.float32)
+            return gym.wrappers.DtypeObservation(ErrorReporting(make_env(env_spec)), np.float32)
 
     model = SAC(
         "MlpPolicy",
@@ -306,7 +306,7 @@ def _screen(folder: TrainingFolder, rollouts: Rollouts, policy: Policy, step: in
     row: dict[str, float] = {"episodes": episodes}
     for how, deterministic in (("stochastic", False), ("deterministic", True)):
         stream = (int(Purpose.RUNG), step, int(deterministic))
-        episode_stats = gathered(rollouts.start_evaluation(policy, folder.seed, stream, episodes, deterministic))
+        episode_stats = rollouts.evaluate(policy, folder.seed, stream, episodes, deterministic)
         row |= summary(episode_stats, f"{how}_")
     return row
 

@@ -184,10 +184,10 @@ class Plan:
         size = f"{counted(runs, 'run'):>9} x {spec.steps:>{width},} updates"
         return f"  {name}{size} at {rate.updates:>5,.0f}/s: {duration(cost)}"
 
-    def _recording(self, missing: Sequence[Source], spec: str, step_time: float) -> str:
+    def _recording(self, missing: Sequence[Source], env_spec: str, step_time: float) -> str:
         steps = sum(_size(source) for source in missing)
         self._seconds += steps * step_time / self.bench.machine.workers
-        self._disk += steps * _bytes_per_step(spec)
+        self._disk += steps * _bytes_per_step(env_spec)
         return f"  to record first: {', '.join(source.id for source in missing)} ({steps:,} transitions)"
 
     def _total(self) -> Iterator[str]:
@@ -230,9 +230,9 @@ def _size(source: Source) -> int:
     return full_size(parts, load_recipe(source.env).dataset_steps)
 
 
-def _bytes_per_step(spec: str) -> int:
+def _bytes_per_step(env_spec: str) -> int:
     """Return the bytes of a transition on disk: in the dataset (float64 observations) and in the cache (float32)."""
-    observations, actions = spaces_of(make_env(spec), "the environment")
+    observations, actions = spaces_of(make_env(env_spec), "the environment")
     return 12 * observations.shape[0] + 8 * actions.shape[0] + 34
 
 

@@ -116,9 +116,9 @@ def random_data(env_spec: str, rows: int = ROWS) -> Transitions:
     )
 
 
-def step_seconds(spec: str) -> float:
+def step_seconds(env_spec: str) -> float:
     """Return the seconds of one step of an environment under uniform actions."""
-    env = make_env(spec)
+    env = make_env(env_spec)
     reset(env, 0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(ENV_STEPS)]

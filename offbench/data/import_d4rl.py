@@ -169,9 +169,9 @@ def _by_name(source: Source, recipe: Recipe) -> _Origin:
     return _Origin(recorded, None, recipe)
 
 
-def _shapes(spec: str) -> tuple[int, int]:
+def _shapes(env_spec: str) -> tuple[int, int]:
     """Return the dimensions of observations and actions of an environment with flat spaces."""
-    observations, actions = spaces_of(make_env(spec), "the environment")
+    observations, actions = spaces_of(make_env(env_spec), "the environment")
     return observations.shape[0], actions.shape[0]
 
 

@@ -31,7 +31,7 @@ BYTES_PER_EPISODE = 14_000  # what HDF5 needs in addition to the numbers, measur
 def write(
     path: Path,
     episodes: Iterable[Episode],
-    spec: str | None,
+    env_spec: str | None,
     metadata: JsonObject,
     steps: int,
     spaces: tuple[Space, Space],
@@ -41,13 +41,13 @@ def write(
 
     Args:
         path: the folder of a claimed id; an existing dataset is replaced at the end.
-        spec: the environment's EnvSpec as JSON, None if unknown.
+        env_spec: the environment's EnvSpec as JSON, None if unknown.
         metadata: Minari's fields; the content hash joins those under the key `offbench`.
         steps: the expected transitions, to check that the disk has room.
         spaces: of observations and actions; Minari would otherwise make the environment, which may no longer exist.
         expected: the content hash that the data must have (None: any).
     """
-    env_spec = parse_spec(spec) if spec else None
+    spec = parse_spec(env_spec) if env_spec else None
     temporary = hidden_path(path, "partial")
     check_ownership(temporary)
     with disk_errors(str(path)):
@@ -55,7 +55,7 @@ def write(
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                storage = MinariStorage.new(temporary / "data", *spaces, env_spec, "hdf5")
+                storage = MinariStorage.new(temporary / "data", *spaces, spec, "hdf5")
             _check_room(temporary, storage, steps)
             content, dtype = ContentHash(), storage.observation_space.dtype
             with safe_file(storage._file_path) as storage._file_path:  # a full disk must not crash libhdf5

@@ -76,20 +76,20 @@ def recorded_mujoco(metadata: JsonObject) -> str | None:
     return next((match[1] for match in pinned if match), None)
 
 
-def margins_matter(spec: str) -> bool:
+def margins_matter(env_spec: str) -> bool:
     """Return whether the rule for contact margins makes a difference in an environment (EnvSpec JSON)."""
     from offbench.envs.contact_margins import has_margins, model_of  # imports MuJoCo, which is slow to load
 
-    env = environments.make_env(spec)
+    env = environments.make_env(env_spec)
     model = model_of(env)
     env.close()
     return model is not None and has_margins(model)
 
 
-def report_margin_rule(dataset_id: str, metadata: JsonObject, spec: str) -> None:
+def report_margin_rule(dataset_id: str, metadata: JsonObject, env_spec: str) -> None:
     """Print the contact-margin rule of a dataset's environment (EnvSpec JSON), unless it is the default or unused."""
     rule = recorded_margin(metadata)
-    if rule == EARLIER or not margins_matter(spec):
+    if rule == EARLIER or not margins_matter(env_spec):
         return
     since, installed = MUJOCO_VERSIONS[rule or EARLIER], versions()["mujoco"]
     message = f"{dataset_id}: contact margins as in MuJoCo {since} (installed is {installed})"

@@ -16,13 +16,13 @@ from offbench.common.files import sha256
 LEFT_OUT = ("gymnasium", "offbench", "builtins", "abc", "typing")  # a version is recorded of these, or Python has them
 
 
-def environment_code(spec: str) -> dict[str, str]:
+def environment_code(env_spec: str) -> dict[str, str]:
     """Return {file: hash} of what an environment (EnvSpec JSON) is made of, {} for one of Gymnasium.
 
     It covers the modules of its class, base classes and wrappers, and files that its arguments name, such as MuJoCo
     models.
     """
-    fields, hashes = json.loads(spec), dict[str, str]()
+    fields, hashes = json.loads(env_spec), dict[str, str]()
     for part in (fields, *(fields.get("additional_wrappers") or ())):
         module, _, name = str(part["entry_point"]).partition(":")
         if module.partition(".")[0] not in LEFT_OUT:

@@ -171,9 +171,9 @@ def _warn_no_time_limit(name: str, spec: EnvSpec | None) -> None:
 _warned_no_time_limit: set[str] = set()  # environments that a warning was printed for
 
 
-def make_env(spec: str, render_mode: str | None = None) -> Env:
+def make_env(env_spec: str, render_mode: str | None = None) -> Env:
     """Make the environment of an EnvSpec (JSON) with its contact margins, without Gymnasium's environment checker."""
-    plain, rule = without_margin(spec)
+    plain, rule = without_margin(env_spec)
     made = EnvSpec.from_json(plain)
     made.disable_env_checker = True
     made.kwargs.pop("render_mode", None)  # of whoever recorded the data; it could open a window

@@ -13,21 +13,21 @@ LAST_EARLIER = "3.4.0"  # the last release with the earlier rule
 MUJOCO_VERSIONS = {EARLIER: "before 3.5", ADDED: "3.5 and later"}  # that have each rule
 
 
-def with_margin(spec: str, rule: str) -> str:
+def with_margin(env_spec: str, rule: str) -> str:
     """Return an EnvSpec (JSON) that names the rule for contact margins."""
-    plain = without_margin(spec)[0]
+    plain = without_margin(env_spec)[0]
     return plain if rule == EARLIER else json.dumps(json.loads(plain) | {MARGIN: rule})
 
 
-def without_margin(spec: str) -> tuple[str, str]:
+def without_margin(env_spec: str) -> tuple[str, str]:
     """Return Gymnasium's own EnvSpec (JSON), and the rule for contact margins.
 
     Raises:
         OffbenchError: the EnvSpec names an unknown rule.
     """
-    fields = json.loads(spec)
+    fields = json.loads(env_spec)
     rule = fields.pop(MARGIN, EARLIER)
     if rule not in (EARLIER, ADDED):
         raise OffbenchError(f"{MARGIN} must be {EARLIER} or {ADDED}, not {rule!r}")
     plain = {name: value for name, value in fields.items() if name not in REMOVED_FIELDS}
-    return (spec if plain == fields and MARGIN not in spec else json.dumps(plain)), rule
+    return (env_spec if plain == fields and MARGIN not in env_spec else json.dumps(plain)), rule

@@ -203,13 +203,13 @@ def _shipped_recipe(env_id: str) -> Recipe | None:
     return next((r for r in map(load_recipe, names()) if task and r.env_id.startswith(f"{task[1]}-v")), None)
 
 
-def d4rl_reference(spec: str | None) -> tuple[float, float] | None:
+def d4rl_reference(env_spec: str | None) -> tuple[float, float] | None:
     """Return D4RL's reference returns (random, expert) of an environment (EnvSpec JSON).
 
     They hold for the standard task alone (its versions v2 to v5): None for any other environment, and where arguments,
     time limit or wrappers are not the standard ones.
     """
-    fields = json.loads(spec or "{}")
+    fields = json.loads(env_spec or "{}")
     recipe = _shipped_recipe(str(fields.get("id")))
     if recipe is None or recipe.d4rl_min is None or recipe.d4rl_max is None:
         return None

@@ -6,14 +6,14 @@ from offbench.common.provenance import versions
 from offbench.common.terminal import warn
 
 
-def warn_other_physics(what: str, recorded: dict[str, str], spec: str) -> None:
+def warn_other_physics(what: str, recorded: dict[str, str], env_spec: str) -> None:
     """Print a warning when `what` was made on a MuJoCo that simulates an environment (EnvSpec JSON) differently."""
     made, here = recorded.get("mujoco", ""), versions()["mujoco"]
-    if made and not same_physics(made, here, spec):
+    if made and not same_physics(made, here, env_spec):
         warn(f"{what} was made with mujoco {made}, installed is {here}: the physics differ, scores may not compare")
 
 
-def same_physics(a: str, b: str, spec: str) -> bool:
+def same_physics(a: str, b: str, env_spec: str) -> bool:
     """Return whether two MuJoCo versions simulate an environment alike; see offbench.envs.contact_margins."""
     from offbench.envs.contact_margins import RK4_ROTATIONS_SINCE, model_of, release, rotations_changed
     from offbench.envs.environments import make_env
@@ -23,7 +23,7 @@ def same_physics(a: str, b: str, spec: str) -> bool:
             return True
     except ValueError:
         return a == b
-    env = make_env(spec)
+    env = make_env(env_spec)
     model = model_of(env)
     env.close()
     return model is None or not rotations_changed(model)

@@ -24,7 +24,7 @@ from offbench.envs.recipes import d4rl_reference, load_recipe
 from offbench.envs.trust import REMEDY, is_trusting
 from offbench.evaluation.policies import load_policy
 from offbench.rollouts.policy import Policy
-from offbench.rollouts.rollouts import Rollouts, gathered
+from offbench.rollouts.rollouts import Rollouts
 from offbench.training.run import Run
 from offbench.training.run_config import RunConfig
 
@@ -89,9 +89,7 @@ def evaluate(
         raise OffbenchError(f"{path} is a deterministic policy; leave out --stochastic")
     workers = default_workers(workers)
     with Rollouts(spec, workers if workers > 1 else 0) as rollouts:
-        episode_stats = gathered(
-            rollouts.start_evaluation(policy, seed, (int(Purpose.REFERENCE), 2), episodes, not stochastic)
-        )
+        episode_stats = rollouts.evaluate(policy, seed, (int(Purpose.REFERENCE), 2), episodes, not stochastic)
     returns = [episode.ret for episode in episode_stats]
     env_id = json.loads(spec)["id"]
     # a run's own references are of its own environment

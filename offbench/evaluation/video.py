@@ -119,14 +119,16 @@ def _policy_of(path: str, env: str | Path | None) -> tuple[Policy, str, bool]:
     return ladder.load(rung), spec, True
 
 
-def _renderable(spec: str, backend: str | None) -> Env:
+def _renderable(env_spec: str, backend: str | None) -> Env:
     """Make the environment for rendering. Raises OffbenchError if it cannot be rendered here."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about an unlisted mode: the first frame shows whether it works
-            env = make_env(spec, "rgb_array")
+            env = make_env(env_spec, "rgb_array")
     except Exception as error:  # a third party's environment may raise anything here
-        raise OffbenchError(f"{json.loads(spec)['id']} cannot be rendered (render_mode rgb_array): {error}") from error
+        raise OffbenchError(
+            f"{json.loads(env_spec)['id']} cannot be rendered (render_mode rgb_array): {error}"
+        ) from error
     world: Any = env.unwrapped
     if hasattr(world, "mujoco_renderer"):
         import mujoco

@@ -46,7 +46,7 @@ class Episode:
     """One episode.
 
     Attributes:
-        seed: what the environment was reset with.
+        seed: seed of the environment's reset.
         observations: [T + 1, obs], in the environment's own precision; the last one has no action.
         actions: [T, act], in the environment's bounds and precision.
         rewards: [T] float64.
@@ -72,17 +72,17 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Task:
+class EpisodeTask:
     """A few episodes of one policy: the unit of work of a worker.
 
     Attributes:
-        spec: EnvSpec JSON.
+        env_spec: EnvSpec JSON.
         policy: the bytes of a policy file, or a function, which no worker process is given.
         seed, stream: with an episode's index, the seed of the episode.
-        indices: of the episodes.
+        indices: episode indices.
     """
 
-    spec: str
+    env_spec: str
     policy: bytes | FunctionPolicy
     seed: int
     stream: tuple[int, ...]
@@ -103,8 +103,8 @@ MEASURES = ("return", "low", "high", "length")
 
 def summary(episode_stats: list[EpisodeStats], prefix: str = "") -> dict[str, float]:
     """Return mean `return`, its 95% interval `low` to `high` and mean `length`, keys prefixed with `prefix`."""
-    mean, low, high = interval([o.ret for o in episode_stats])
-    length = float(np.mean([o.length for o in episode_stats]))
+    mean, low, high = interval([stats.ret for stats in episode_stats])
+    length = float(np.mean([stats.length for stats in episode_stats]))
     values = {"return": mean, "low": low, "high": high, "length": length}
     # four decimals, or five digits of a small number: rewards may be tiny
     return {prefix + k: round(v, 4) if abs(v) >= 1 else float(f"{v:.5g}") for k, v in values.items()}
@@ -113,7 +113,7 @@ def summary(episode_stats: list[EpisodeStats], prefix: str = "") -> dict[str, fl
 class _RunningEpisode:
     """One environment in the middle of an episode."""
 
-    def __init__(self, env: Env, policy: Policy | FunctionPolicy, task: Task, slot: int) -> None:
+    def __init__(self, env: Env, policy: Policy | FunctionPolicy, task: EpisodeTask, slot: int) -> None:
         index = task.indices[slot]
         self.env, self.policy, self.slot = env, policy, slot
         self.seed = seeds.integer(task.seed, Purpose.RESET, *task.stream, index)
@@ -228,39 +228,39 @@ def _name(env: Env) -> str:
     return env.spec.id if env.spec else type(env.unwrapped).__name__
 
 
-def play(task: Task) -> list[Episode]:
+def play(task: EpisodeTask) -> list[Episode]:
     """Play a task's episodes and return them in its order."""
     return _play(task, lambda episode: episode)
 
 
-def play_stats(task: Task) -> list[EpisodeStats]:
+def play_stats(task: EpisodeTask) -> list[EpisodeStats]:
     """Play a task's episodes and return their returns and lengths, in its order."""
     return _play(task, lambda episode: EpisodeStats(float(episode.rewards.sum()), len(episode)))
 
 
-def _play(task: Task, keep: Callable[[Episode], T]) -> list[T]:
+def _play(task: EpisodeTask, keep: Callable[[Episode], T]) -> list[T]:
     policy = task.policy if isinstance(task.policy, FunctionPolicy) else _policy(task.policy)
     noisy = policy.needs_noise(task.deterministic)
-    envs = cached_envs(task.spec, min(PARALLEL_EPISODES, len(task.indices)))
+    envs = cached_envs(task.env_spec, min(PARALLEL_EPISODES, len(task.indices)))
     waiting = iter(range(len(task.indices)))
     running = [_RunningEpisode(env, policy, task, slot) for env, slot in zip(envs, waiting, strict=False)]
     done: dict[int, T] = {}
     while running:
         if closing():
             raise CancelledError
-        observations = np.array([episode_run.observations[-1] for episode_run in running])
-        noise = np.array([episode_run.next_noise() for episode_run in running]) if noisy else None
+        observations = np.array([running_episode.observations[-1] for running_episode in running])
+        noise = np.array([running_episode.next_noise() for running_episode in running]) if noisy else None
         actions = policy.act(observations, noise)
         still_running = []
-        for episode_run, action in zip(running, actions, strict=True):
-            episode = episode_run.step(action)
+        for running_episode, action in zip(running, actions, strict=True):
+            episode = running_episode.step(action)
             if episode is None:
-                still_running.append(episode_run)
+                still_running.append(running_episode)
                 continue
-            done[episode_run.slot] = keep(episode)
+            done[running_episode.slot] = keep(episode)
             slot = next(waiting, None)
             if slot is not None:
-                still_running.append(_RunningEpisode(episode_run.env, policy, task, slot))
+                still_running.append(_RunningEpisode(running_episode.env, policy, task, slot))
         running = still_running
     return [done[slot] for slot in range(len(task.indices))]
 
@@ -271,16 +271,16 @@ def _policy(data: bytes) -> Policy:
 
 
 @functools.lru_cache(maxsize=4)
-def _env_cache(spec: str) -> list[Env]:
+def _env_cache(env_spec: str) -> list[Env]:
     return []
 
 
-def cached_envs(spec: str, count: int) -> list[Env]:
+def cached_envs(env_spec: str, count: int) -> list[Env]:
     """Return `count` environments of this process, made once and kept."""
-    pool = _env_cache(spec)
+    pool = _env_cache(env_spec)
     while len(pool) < count:
         try:
-            pool.append(make_env(spec))
+            pool.append(make_env(env_spec))
         except Exception as error:  # a worker may lack what the process that started it has
             raise OffbenchError(f"cannot make an environment in a worker process: {reason(error)}") from error
     return pool[:count]
@@ -292,8 +292,8 @@ class Rollouts:
     Use as a context manager. Results do not depend on `workers`. A FunctionPolicy needs workers = 0.
     """
 
-    def __init__(self, spec: str, workers: int = 0) -> None:
-        self.spec, self.workers = spec, workers
+    def __init__(self, env_spec: str, workers: int = 0) -> None:
+        self.env_spec, self.workers = env_spec, workers
         self._pool: ProcessPoolExecutor | None = None
         if workers:
             context = multiprocessing.get_context("spawn")
@@ -349,7 +349,7 @@ class Rollouts:
                             break
                         size = min(size, max(LAST_TASK, math.ceil(wanted / ahead)))
                     indices = tuple(range(begun, begun + size))
-                    pending.append(self.call(play, Task(self.spec, data, seed, stream, indices, False)))
+                    pending.append(self.call(play, EpisodeTask(self.env_spec, data, seed, stream, indices, False)))
                     begun += size
                 for episode in result(pending.popleft()):
                     done, steps = done + 1, steps + len(episode)
@@ -361,13 +361,19 @@ class Rollouts:
     def start_evaluation(
         self, policy: Policy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
     ) -> list[Future[list[EpisodeStats]]]:
-        """Start `count` evaluation episodes; `gathered` waits for their returns and lengths, in order."""
+        """Start `count` evaluation episodes; `gather` waits for their returns and lengths."""
         data, parts = policy.to_bytes(), max(1, min(self.workers, count // 2))  # a task per worker, if they suffice
         tasks = (
-            Task(self.spec, data, seed, stream, tuple(chunk.tolist()), deterministic)
+            EpisodeTask(self.env_spec, data, seed, stream, tuple(chunk.tolist()), deterministic)
             for chunk in np.array_split(np.arange(count), parts)
         )
         return [self.call(play_stats, task) for task in tasks]
+
+    def evaluate(
+        self, policy: Policy, seed: int, stream: tuple[int, ...], count: int, deterministic: bool
+    ) -> list[EpisodeStats]:
+        """Play `count` evaluation episodes; return their returns and lengths, in order."""
+        return gather(self.start_evaluation(policy, seed, stream, count, deterministic))
 
 
 def result(future: Future[T]) -> T:
@@ -378,7 +384,7 @@ def result(future: Future[T]) -> T:
         raise _worker_died() from None
 
 
-def gathered(futures: Iterable[Future[list[T]]]) -> list[T]:
+def gather(futures: Iterable[Future[list[T]]]) -> list[T]:
     """Return the results of several tasks, concatenated in order."""
     return [item for future in futures for item in result(future)]
 

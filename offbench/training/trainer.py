@@ -25,7 +25,7 @@ from offbench.common.scores import normalize
 from offbench.common.seeds import Purpose
 from offbench.common.terminal import inform
 from offbench.data.transitions import Transitions
-from offbench.rollouts.rollouts import EpisodeStats, Rollouts, gathered
+from offbench.rollouts.rollouts import EpisodeStats, Rollouts, gather
 from offbench.training.claim import new_run_config
 from offbench.training.loggers import Loggers
 from offbench.training.registry import load_algorithm
@@ -234,7 +234,7 @@ class Trainer:
     def _finish_evaluations(self) -> None:
         """Wait for all evaluations that are running, and write them to the runs' files."""
         for i, step, futures in self.pending:
-            self.evaluations[i][step] = [(episode.ret, episode.length) for episode in gathered(futures)]
+            self.evaluations[i][step] = [(episode.ret, episode.length) for episode in gather(futures)]
             self.runs[i].write_evaluations(self.evaluations[i])
         if self.pending:
             self.note = self._score_note(self.pending[0][1])

@@ -38,15 +38,15 @@ class ReplayResult:
     rounding: bool = False  # whether a replay from the seed differs, at first in the last bits only
 
 
-def replay_episode(spec: str, episode: RecordedEpisode, exact: bool, last_unknown: bool) -> ReplayResult:
+def replay_episode(env_spec: str, episode: RecordedEpisode, exact: bool, last_unknown: bool) -> ReplayResult:
     """Replay one episode by the strictest method that it allows.
 
     Args:
-        spec: the environment it was recorded in, EnvSpec JSON.
+        env_spec: the environment it was recorded in, EnvSpec JSON.
         exact: the installed simulator is the recorded one, so bits must agree.
         last_unknown: a terminated episode's last observation is a placeholder, as after an import from D4RL.
     """
-    env = cached_envs(spec, 1)[0]
+    env = cached_envs(env_spec, 1)[0]
     if episode.seed is not None and exact and not last_unknown:
         from_seed = _from_seed(env, episode, 0.0)
         if not from_seed.rounding:

@@ -93,10 +93,10 @@ def _verify(dataset_id: str, episodes: int | None, workers: int | None) -> Repor
     return report
 
 
-def _limit(spec: str | None) -> int | None:
+def _limit(env_spec: str | None) -> int | None:
     """Return the time limit that an EnvSpec (JSON) names, if it does."""
     try:
-        limit = json.loads(spec or "null")["max_episode_steps"]
+        limit = json.loads(env_spec or "null")["max_episode_steps"]
     except (TypeError, KeyError, ValueError, RecursionError):
         return None
     return limit if isinstance(limit, int) and limit > 0 else None
@@ -143,9 +143,9 @@ def _replay(
     names = [int(data.episode_indices[i]) for i in chosen]
     with Rollouts(spec, workers if workers > 1 and steps > FEW_STEPS else 0) as rollouts:
 
-        def replay(spec: str, episodes: Iterable[RecordedEpisode]) -> list[ReplayResult]:
+        def replay(env_spec: str, episodes: Iterable[RecordedEpisode]) -> list[ReplayResult]:
             jobs = [
-                rollouts.call(replay_episode, spec, e, exact, last_unknown and bool(e.terminations[-1]))
+                rollouts.call(replay_episode, env_spec, e, exact, last_unknown and bool(e.terminations[-1]))
                 for e in episodes
             ]
             return [result(job) for job in jobs]
@@ -167,10 +167,10 @@ def _replay(
     _add_replays(replays, made if exact else None, report, findings)
 
 
-def _same_spaces(spec: str, data: MinariDataset, report: Report, findings: Findings) -> bool:
+def _same_spaces(env_spec: str, data: MinariDataset, report: Report, findings: Findings) -> bool:
     """Return whether the environment can be made and has the dataset's spaces; report why not."""
     try:
-        env = untrusted_env(spec, "playing episodes again")
+        env = untrusted_env(env_spec, "playing episodes again")
     except OffbenchError as error:
         report.skipped.append(str(error))
         return False

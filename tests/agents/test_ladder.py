@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -199,13 +198,11 @@ def test_a_build_that_was_interrupted_measures_nothing_again(tiny: tuple[str, st
 
         calls = 0
 
-        def start_evaluation(self, *_: Any) -> list[Future[list[EpisodeStats]]]:
+        def evaluate(self, *_: Any) -> list[EpisodeStats]:
             self.calls += 1
             if self.calls > 2:
                 raise PlayedError
-            future: Future[list[EpisodeStats]] = Future()
-            future.set_result([EpisodeStats(30.0 + i, 9) for i in range(8)])
-            return [future]
+            return [EpisodeStats(30.0 + i, 9) for i in range(8)]
 
     def evaluator_of(folder: TrainingFolder) -> RungEvaluator:
         return RungEvaluator(folder, rows, folder.policy_steps(), Counting())  # type: ignore[arg-type]

@@ -238,7 +238,7 @@ def test_an_update_that_changes_later_on_is_refused(monkeypatch: pytest.MonkeyPa
         def setup(self, c: Config) -> None:
             super().setup(c)
             count = itertools.count()
-            self.early = lambda: next(count) < captured_update.RECORDED_UPDATES
+            self.early = lambda: next(count) < captured_update.TRACED_UPDATES
 
         def loss(self, error: Tensor) -> Tensor:
             return super().loss(error) * (1.0 if self.early() else 0.5)

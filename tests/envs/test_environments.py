@@ -27,7 +27,7 @@ from offbench.envs.environments import (
 )
 from offbench.envs.recipes import d4rl_reference
 from offbench.rollouts.policy import uniform
-from offbench.rollouts.rollouts import ErrorReporting, Rollouts, gathered, scalar_reward
+from offbench.rollouts.rollouts import ErrorReporting, Rollouts, gather, scalar_reward
 from offbench.verification.resimulate import replay_episode
 
 PENDULUM = (np.full(1, -3, np.float32), np.full(1, 3, np.float32))
@@ -70,7 +70,7 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> str:
 def play(spec: str) -> list[float]:
     policy = uniform(np.full(1, -1, np.float32), np.full(1, 1, np.float32), 3, "Steps-v0")
     with Rollouts(spec) as rollouts:
-        return [outcome.ret for outcome in gathered(rollouts.start_evaluation(policy, 0, (), 2, False))]
+        return [stats.ret for stats in gather(rollouts.start_evaluation(policy, 0, (), 2, False))]
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from offbench.common.files import sha256_of
 from offbench.common.seeds import Purpose, generator
 from offbench.evaluation.similarity import similarity
 from offbench.rollouts.policy import MOST_VALUES, Policy
-from offbench.rollouts.rollouts import NOISE_BLOCK, Task, _RunningEpisode
+from offbench.rollouts.rollouts import NOISE_BLOCK, EpisodeTask, _RunningEpisode
 from offbench.training.run import Run
 from tests.made_runs import made_run
 
@@ -152,7 +152,7 @@ def best_by_q(samples: int, width: int) -> Policy:
 
 @pytest.mark.parametrize("samples", [1, 100, 5000])
 def test_noise_is_drawn_in_blocks_that_change_no_number(samples: int) -> None:
-    policy, task = best_by_q(samples, 8), Task("", b"", 0, (), (0,), False)
+    policy, task = best_by_q(samples, 8), EpisodeTask("", b"", 0, (), (0,), False)
     with gym.make(policy.env_id) as env:
         lane = _RunningEpisode(env, policy, task, 0)
         rows = []

@@ -32,9 +32,9 @@ from offbench.rollouts.rollouts import (
     PARALLEL_EPISODES,
     Episode,
     EpisodeStats,
+    EpisodeTask,
     Rollouts,
-    Task,
-    gathered,
+    gather,
     play,
     summary,
 )
@@ -81,7 +81,7 @@ def plain(env_id: str) -> gym.Env:
 def test_an_episode_equals_one_played_by_hand_with_gymnasium() -> None:
     """Episode 11 of a task of 20, replayed alone in an environment of its own from its seeds."""
     spec, policy = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5")
-    episodes = play(Task(spec, policy.to_bytes(), 5, (2,), tuple(range(20)), False))
+    episodes = play(EpisodeTask(spec, policy.to_bytes(), 5, (2,), tuple(range(20)), False))
     episode = episodes[11]
     assert isinstance(episode, Episode)
     env = plain("Hopper-v5")
@@ -100,9 +100,9 @@ def test_an_episode_equals_one_played_by_hand_with_gymnasium() -> None:
 def test_more_episodes_than_lanes_keep_their_order() -> None:
     spec, policy = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5")
     indices = tuple(range(PARALLEL_EPISODES * 2 + 3))
-    together = play(Task(spec, policy.to_bytes(), 0, (), indices, False))
+    together = play(EpisodeTask(spec, policy.to_bytes(), 0, (), indices, False))
     for index in indices[::5]:
-        (alone,) = play(Task(spec, policy.to_bytes(), 0, (), (index,), False))
+        (alone,) = play(EpisodeTask(spec, policy.to_bytes(), 0, (), (index,), False))
         assert isinstance(alone, Episode)
         np.testing.assert_array_equal(alone.observations, together[index].observations)  # type: ignore[union-attr]
 
@@ -175,24 +175,24 @@ def test_sigterm_to_all_processes_leaves_evaluations_to_the_parent() -> None:
     """Slurm sends it so; the parent saves a checkpoint, and that waits for the evaluations under way."""
     policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     with Rollouts(POLE, workers=2) as rollouts:
-        gathered(rollouts.start_evaluation(policy, 0, (), 1, True))
+        gather(rollouts.start_evaluation(policy, 0, (), 1, True))
         futures = rollouts.start_evaluation(policy, 0, (), 400, False)
         assert rollouts._pool is not None
         for pid in rollouts._pool._processes:
             os.kill(pid, signal.SIGTERM)
-        assert len(gathered(futures)) == 400
+        assert len(gather(futures)) == 400
 
 
 def test_a_killed_worker_ends_those_beside_it() -> None:
     policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     with Rollouts(POLE, workers=2) as rollouts:
-        gathered(rollouts.start_evaluation(policy, 0, (), 100, False))
+        gather(rollouts.start_evaluation(policy, 0, (), 100, False))
         assert rollouts._pool is not None
         first, *beside = rollouts._pool._processes
         futures = rollouts.start_evaluation(policy, 0, (), 4000, False)
         os.kill(first, signal.SIGKILL)
         with pytest.raises(OffbenchError, match="a worker process died"):
-            gathered(futures)
+            gather(futures)
         began = time.monotonic()
     assert beside
     assert time.monotonic() - began < 30
@@ -201,8 +201,8 @@ def test_a_killed_worker_ends_those_beside_it() -> None:
 def test_leaving_the_pool_ends_what_is_being_played() -> None:
     policy = uniform(*BOUNDS, 11, "Hopper-v5")
     with Rollouts(env_spec("Hopper-v5"), workers=1) as rollouts:
-        assert len(gathered(rollouts.start_evaluation(policy, 0, (), 1, False))) == 1
-        many = Task(rollouts.spec, policy.to_bytes(), 0, (), tuple(range(10**6)), False)
+        assert len(gather(rollouts.start_evaluation(policy, 0, (), 1, False))) == 1
+        many = EpisodeTask(rollouts.env_spec, policy.to_bytes(), 0, (), tuple(range(10**6)), False)
         future = rollouts.call(play, many)
         while not future.running():
             time.sleep(0.01)

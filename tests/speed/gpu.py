@@ -46,7 +46,7 @@ def stack_of(algorithm: str, runs: int, device: str, *, captured: bool = True, *
         configs.append(build(kind.Config, own, algorithm))
     stack = random_stack(kind, configs, spec, device)
     if not captured:
-        stack.captured_update._side = None
+        stack.captured_update.eager = True
     return stack
 
 

@@ -25,7 +25,7 @@ from offbench.common.provenance import hardware, has_bfloat16
 from offbench.common.tables import markdown
 from offbench.envs.environments import make_env
 from offbench.envs.recipes import load_recipe
-from offbench.rollouts.rollouts import PARALLEL_EPISODES, Task, play
+from offbench.rollouts.rollouts import PARALLEL_EPISODES, EpisodeTask, play
 from offbench.training.captured_update import TRACED_UPDATES
 from tests.speed.__main__ import DOCS
 from tests.speed.sides import ENV, stack_of
@@ -43,9 +43,9 @@ def recording() -> dict[str, float]:
     ladder = read_ladder(recipe.folder / "behaviour")
     assert ladder is not None
     policy = ladder.load(ladder.role("medium")).to_bytes()
-    task = Task(recipe.env_spec(), policy, 0, (), tuple(range(PARALLEL_EPISODES)), False)
+    task = EpisodeTask(recipe.env_spec(), policy, 0, (), tuple(range(PARALLEL_EPISODES)), False)
     episodes = play(task)
-    env = make_env(task.spec)
+    env = make_env(task.env_spec)
     inner: Any = env.unwrapped
     model, data, skip = inner.model, inner.data, inner.frame_skip
 

@@ -196,7 +196,7 @@ def evaluate(workers: str, episodes: str = "20") -> Work:
     """offbench's evaluation of the expert; a unit is one episode."""
     from offbench.agents.ladder import read_ladder
     from offbench.envs.recipes import load_recipe
-    from offbench.rollouts.rollouts import Rollouts, gathered
+    from offbench.rollouts.rollouts import Rollouts, gather
 
     recipe = load_recipe(ENV)
     assert recipe.folder is not None
@@ -207,7 +207,7 @@ def evaluate(workers: str, episodes: str = "20") -> Work:
     numbers = itertools.count()
 
     def work() -> int:
-        return len(gathered(rollouts.start_evaluation(policy, next(numbers), (0,), int(episodes), True)))
+        return len(gather(rollouts.start_evaluation(policy, next(numbers), (0,), int(episodes), True)))
 
     return work
 

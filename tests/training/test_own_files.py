@@ -64,7 +64,7 @@ def test_a_file_trains_resumes_and_reports(home: Path, capsys: pytest.CaptureFix
     assert whole.losses_path.read_bytes() == pieces.losses_path.read_bytes()
     assert pieces.folder == Path("runs") / DATA / "AWAC" / "batch_size=16,hidden=8x8" / "seed-0"
     again(home)
-    del os.environ[registry.OWN_VARIABLE]
+    del os.environ[registry.USER_ALGORITHMS_VARIABLE]
     said = refusal(["evaluate", str(pieces.folder), "--similarity"], capsys)
     assert "unknown algorithm 'AWAC'" in said
     assert "for a file of your own, give --algorithm ./FILE.py:CLASS" in said

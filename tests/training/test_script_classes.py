@@ -55,7 +55,7 @@ HELPER = "import parts\ndef halved(value):\n    return value * parts.HALF\n"
 @pytest.fixture(autouse=True)
 def _forget(monkeypatch: pytest.MonkeyPatch, home: Path) -> None:
     """Forget the classes and modules of each test."""
-    monkeypatch.setattr(registry, "_own", {})
+    monkeypatch.setattr(registry, "_user_algorithms", {})
     monkeypatch.syspath_prepend(str(home))
     for name in ("helper", "parts"):
         monkeypatch.delitem(sys.modules, name, raising=False)
