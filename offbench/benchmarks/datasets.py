@@ -82,7 +82,7 @@ def _differences(metadata: JsonObject, source: Source, recipe: Recipe) -> Iterat
 
 
 def _level_name(level: str) -> str:
-    """Return a level as in dataset ids, so that 0.60 equals 0.6; anything else (a blend) unchanged."""
+    """Return a level as in dataset ids, so that 0.60 equals 0.6; anything else (a mix) unchanged."""
     try:
         return parse_level(level)[0]
     except (OffbenchError, AttributeError, TypeError):

@@ -157,7 +157,7 @@ def _source(value: object, folder: Path, where: str) -> Source:
 def _recipe_of(dataset_id: str) -> tuple[str, str]:
     """Return the shipped recipe and the level that an id names, ("", "") if there is none.
 
-    Datasets of another version (such as D4RL's), blends and policies of one's own can be used but not recorded.
+    Datasets of another version (such as D4RL's), mixes and policies of one's own can be used but not recorded.
     """
     env, level = recipe_and_level(dataset_id)
     if env and dataset_id.rpartition("-v")[2] != str(load_recipe(env).version):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from offbench.agents.ladder import BEHAVIOUR, Ladder, Rung, find_ladder
+from offbench.agents.ladder import BEHAVIOUR, Ladder, find_ladder
 from offbench.common.code_hash import changes
 from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import JsonObject
@@ -55,9 +54,9 @@ def collect(
     Args:
         env: a shipped recipe's name (`hopper`) or a recipe file (`./my-env.toml`).
         level: random, medium, medium-replay, medium-expert, expert, or a fraction such as 0.6.
-        mix: a blend instead of a level, e.g. "random:0.5,expert:0.5".
+        mix: a mix of levels instead of one level, e.g. "random:0.5,expert:0.5".
         steps: transitions; default: the recipe's (1,000,000 per part; medium-replay: all of the training's).
-        seed: of the recorded episodes. The same seed gives the same content for any number of workers.
+        seed: seed of the episodes. The same seed gives the same content for any number of workers.
         workers: recording processes (default: one per core).
         dataset_id: the Minari id; default `<env>-<level>-v<version>`.
         overwrite: replace a dataset of that id. Without it, the same dataset recorded again is left as it is, and
@@ -67,8 +66,8 @@ def collect(
         policy: record with this policy instead of a level: an agent's zip of Stable-Baselines3 (only its tensors are
             read), a run's folder, a policy file, or `module:function` of the user's own. It acts as it was
             trained to explore: a stochastic one samples.
-        name: of the level that such a dataset gets; default: the policy's own name.
-        behaviour_dir: where agents trained here live.
+        name: level name in the id of such a dataset; default: the policy's own name.
+        behaviour_dir: the folder of agents trained here.
 
     Returns:
         The dataset's id, for `minari.load_dataset` or `offbench.load`.
@@ -94,16 +93,14 @@ def collect(
         raise OffbenchError(f"steps must be at least 1, not {steps}")
     workers = default_workers(workers)
 
-    def prepare(ladder: Ladder | None) -> tuple[Recording, list[Rung | None], list[int], JsonObject]:
-        recording = Recording(recipe, ladder, seed, workers, policy_source)
-        sources = [recording.source(part, accept) for part in parts]
-        counts = recording.counts(parts, steps)
-        return recording, sources, counts, _metadata(recording, dataset_id, mix or level, parts, sources, counts)
+    def prepare(ladder: Ladder | None) -> tuple[Recording, JsonObject]:
+        recording = Recording(recipe, parts, ladder, seed, workers, policy_source, steps=steps, accept=accept)
+        return recording, _metadata(recording, dataset_id, mix or level)
 
     ladder = find_ladder(recipe, Path(behaviour_dir), retrain)
-    trained = ladder is not None or all(part.source in WITHOUT_AGENT for part in parts)
-    prepared = prepare(ladder) if trained else None
-    if prepared and not overwrite and minari_store.exists(dataset_id) and _is_same(dataset_id, prepared[-1]):
+    has_agent = ladder is not None or all(part.source in WITHOUT_AGENT for part in parts)
+    prepared = prepare(ladder) if has_agent else None
+    if prepared and not overwrite and minari_store.exists(dataset_id) and _is_same(dataset_id, prepared[1]):
         if prepared[0].calls_function:
             raise OffbenchError(
                 f"{dataset_id} is recorded already, but {policy} may act differently now (a function can read files); "
@@ -116,12 +113,11 @@ def collect(
         if prepared is None:
             ladder = _train(env, Path(behaviour_dir), workers)
             prepared = prepare(ladder)
-        recording, sources, counts, metadata = prepared
-        total = sum(counts)
+        recording, metadata = prepared
+        total = sum(recording.counts)
         with Progress(total, f"recording {dataset_id}") as progress:
-            streams = (recording.episodes(*item) for item in zip(parts, sources, counts, itertools.count()))
-            episodes = _counted(itertools.chain.from_iterable(streams), progress)
-            content = minari_writer.write(path, episodes, recording.spec, metadata, total, recording.spaces)
+            episodes = _counted(recording.episodes(), progress)
+            content = minari_writer.write(path, episodes, recording.env_spec, metadata, total, recording.spaces)
     if seed == 0 and steps is None and not retrain and (comparison := compare_with_card(recipe, name, content)):
         inform(comparison)
     if ladder:
@@ -136,10 +132,10 @@ def _is_same(dataset_id: str, wanted: JsonObject) -> bool:
         DamagedError: its data cannot be opened.
     """
     recorded = minari_store.provenance(minari_store.read_metadata(dataset_id))
-    ours = minari_store.provenance(json.loads(json.dumps({minari_store.KEY: wanted[minari_store.KEY]})))  # as written
-    same = all(recorded.versions.get(name) == ours.versions.get(name) for name in PHYSICS)
-    same = same and all(getattr(recorded, key) == getattr(ours, key) for key in IDENTITY)
-    if same and (changed := changes(recorded.env_code, ours.env_code)):
+    new = minari_store.provenance(json.loads(json.dumps({minari_store.KEY: wanted[minari_store.KEY]})))  # as written
+    same = all(recorded.versions.get(name) == new.versions.get(name) for name in PHYSICS)
+    same = same and all(getattr(recorded, key) == getattr(new, key) for key in IDENTITY)
+    if same and (changed := changes(recorded.env_code, new.env_code)):
         raise OffbenchError(
             f"{dataset_id} was recorded in other code of its environment: {changed}; use --overwrite to replace it, "
             "or --id for another id"
@@ -170,39 +166,30 @@ def _counted(episodes: Iterator[Episode], progress: Progress) -> Iterator[Episod
         progress.to(progress.done + len(episode))
 
 
-def _metadata(
-    recording: Recording,
-    dataset_id: str,
-    level: str,
-    parts: tuple[Part, ...],
-    sources: list[Rung | None],
-    counts: list[int],
-) -> JsonObject:
+def _metadata(recording: Recording, dataset_id: str, level: str) -> JsonObject:
     """Return the dataset's metadata: Minari's fields, and offbench's own under one key."""
     recipe, references, made = recording.recipe, recording.references, versions()
-    described = [recording.describe(*item) for item in zip(parts, sources, counts, strict=True)]
-    full, total = recording.full_size(parts), sum(counts)
+    full, total = recording.full_size, sum(recording.counts)
     mujoco, margins = f"mujoco=={made['mujoco']}", ""
-    if recording.margins:
+    if recording.has_margins:
         margins = f" Contact margins as in MuJoCo {MUJOCO_VERSIONS[recipe.contact_margin]}: see offbench.make_env."
-        if recipe.contact_margin == EARLIER and same_physics(LAST_EARLIER, made["mujoco"], recording.spec):
+        if recipe.contact_margin == EARLIER and same_physics(LAST_EARLIER, made["mujoco"], recording.env_spec):
             mujoco = f"mujoco<={LAST_EARLIER}"
     short = f" A short recording: {total:,} of {full:,} transitions." if total < full else ""
-    origin_texts = [recording.origin_text(part, rung) for part, rung in zip(parts, sources, strict=True)]
     if recording.own_policy:
         algorithm = recording.own_policy.algorithm
     else:
-        algorithm = "random" if all(part.source == "uniform" for part in parts) else "SAC (Stable-Baselines3)"
+        uniform = all(part.source == "uniform" for part in recording.parts)
+        algorithm = "random" if uniform else "SAC (Stable-Baselines3)"
     return {
         "dataset_id": dataset_id,
         "minari_version": made["minari"],
-        "eval_env_spec": without_margin(recording.spec)[0],
+        "eval_env_spec": without_margin(recording.env_spec)[0],
         "algorithm_name": algorithm,
         "author": {"offbench"},
         "author_email": {"offbench@example.org"},
         "code_permalink": f"{REPOSITORY}/tree/v{made['offbench']}",
-        "description": f"{recipe.env_id}, level {level}: {', then '.join(origin_texts)}. Recorded by offbench."
-        f"{margins}{short}",
+        "description": f"{recipe.env_id}, level {level}: {recording.origin}. Recorded by offbench.{margins}{short}",
         "requirements": [mujoco, f"gymnasium=={made['gymnasium']}"],
         "ref_min_score": references["random"]["return"],
         **({"ref_max_score": references["expert"]["return"]} if "expert" in references else {}),
@@ -213,12 +200,12 @@ def _metadata(
             "level": level,
             "seed": recording.seed,
             "recipe_sha256": recipe.sha256(),
-            "parts": described,
+            "parts": recording.definitions,
             "full_size": full,
             "references": references,
             "d4rl": recipe.d4rl_reference(),
-            MARGIN: recipe.contact_margin if recording.mujoco else None,
-            **({"env_code": code} if (code := environment_code(recording.spec)) else {}),
+            MARGIN: recipe.contact_margin if recording.uses_mujoco else None,
+            **({"env_code": code} if (code := environment_code(recording.env_spec)) else {}),
             "versions": made,
         },
     }

@@ -79,7 +79,7 @@ def level_argument(name: str) -> str:
 
 
 def parse_mix(text: str) -> tuple[str, tuple[Part, ...]]:
-    """Return (name, parts) of a blend such as `random:0.5,expert:0.5`; shares are of the recipe's steps.
+    """Return (name, parts) of a mix such as `random:0.5,expert:0.5`; shares are of the recipe's steps.
 
     Raises:
         OffbenchError: not of that form, an unknown level, or shares that do not add up to 1.

@@ -26,17 +26,40 @@ WITHOUT_AGENT = ("uniform", POLICY)  # sources that need no behaviour agent
 
 
 class Recording:
-    """What all parts of one dataset share. Without a ladder, only WITHOUT_AGENT parts can be recorded."""
+    """A dataset that is to be recorded. Without a ladder, all its parts must be WITHOUT_AGENT.
+
+    Args:
+        policy_source: the user's own policy, as `read_behaviour_policy` takes it.
+        steps: the number of transitions; None for the full size.
+        accept: whether to record the nearest policy even if none is near what a part is defined as.
+
+    Attributes:
+        parts: the parts that the level consists of.
+        rungs: the rung that plays each part; None for uniform actions, the replay and a user's own policy.
+        counts: the number of transitions of each part.
+
+    Raises:
+        OffbenchError: no rung is near what a part is defined as, or there are too few or too many steps.
+    """
 
     def __init__(
-        self, recipe: Recipe, ladder: Ladder | None, seed: int, workers: int, policy_source: str | None
+        self,
+        recipe: Recipe,
+        parts: tuple[Part, ...],
+        ladder: Ladder | None,
+        seed: int,
+        workers: int,
+        policy_source: str | None,
+        *,
+        steps: int | None,
+        accept: bool,
     ) -> None:
-        self.recipe, self._ladder, self.seed = recipe, ladder, seed
+        self.recipe, self.parts, self._ladder, self.seed = recipe, parts, ladder, seed
         self.workers = workers if workers > 1 else 0  # a single one would be no faster than this process
-        self.spec = recipe.env_spec()
-        env = make_env(self.spec)
+        self.env_spec = recipe.env_spec()
+        env = make_env(self.env_spec)
         model = model_of(env)
-        self.mujoco, self.margins = model is not None, model is not None and has_margins(model)
+        self.uses_mujoco, self.has_margins = model is not None, model is not None and has_margins(model)
         self.spaces = self.observation_space, action_space = spaces_of(env, recipe.env_id)
         self.bounds = action_space.low, action_space.high
         self.own_policy: BehaviourPolicy | None = None
@@ -44,6 +67,8 @@ class Recording:
             self.own_policy = read_behaviour_policy(
                 policy_source, *self.bounds, self.observation_space.shape[0], recipe.env_id
             )
+        self.rungs = [self._rung(part, accept) for part in parts]
+        self.counts = self._counts(steps)
 
     @property
     def calls_function(self) -> bool:
@@ -61,21 +86,21 @@ class Recording:
         """The random and the expert reference; without a ladder the random one, measured here as a ladder's is."""
         if self._ladder:
             return dict(self._ladder.info.references)
-        with Rollouts(self.spec, self.workers) as rollouts:
+        with Rollouts(self.env_spec, self.workers) as rollouts:
             return {"random": random_reference(self.recipe, 0, rollouts)}
 
-    def full_size(self, parts: tuple[Part, ...]) -> int:
-        """Return the transitions of a dataset at its full size."""
+    @property
+    def full_size(self) -> int:
+        """The number of transitions of the dataset at its full size."""
         replay_steps = self._ladder.info.medium_replay.transitions if self._ladder else None
-        return full_size(parts, self.recipe.dataset_steps, replay_steps)
+        return full_size(self.parts, self.recipe.dataset_steps, replay_steps)
 
-    def counts(self, parts: tuple[Part, ...], steps: int | None) -> list[int]:
-        """Return the transitions of each part; `steps` are those of all, None for the full size."""
-        total = self.full_size(parts) if steps is None else steps
-        counts = shares(parts, total)
+    def _counts(self, steps: int | None) -> list[int]:
+        total = self.full_size if steps is None else steps
+        counts = shares(self.parts, total)
         if 0 in counts:
-            raise OffbenchError(f"{total} steps leave a part of the blend without a transition; use more --steps")
-        for part, count in zip(parts, counts, strict=True):
+            raise OffbenchError(f"{total} steps leave a part of the mix without transitions; use more --steps")
+        for part, count in zip(self.parts, counts, strict=True):
             if part.source == "replay" and count > (available := self.ladder.info.medium_replay.transitions):
                 raise OffbenchError(
                     f"medium-replay of {self.recipe.name} has {available:,} transitions, not {count:,}; "
@@ -83,12 +108,7 @@ class Recording:
                 )
         return counts
 
-    def source(self, part: Part, accept: bool) -> Rung | None:
-        """Return the rung a part is played by, or None for uniform actions and the replay.
-
-        Raises:
-            OffbenchError: no rung is near what the part is defined as, and the user did not accept another.
-        """
+    def _rung(self, part: Part, accept: bool) -> Rung | None:
         if part.source in WITHOUT_AGENT:
             return None
         if part.source not in ("medium", "replay", "expert"):
@@ -105,7 +125,7 @@ class Recording:
             near = " and ".join(f"{self.ladder.fraction(r):.2f}" for r in self.ladder.neighbors(fraction))
             raise OffbenchError(
                 f"{self.recipe.name} has no policy within {NEAR} of {fraction:g} of the expert's return; the nearest: "
-                f"{near}; use such a fraction, or `offbench collect --accept` to record the nearest"
+                f"{near}; use one of these fractions, or `offbench collect --accept` to record the nearest"
             )
         inform(
             f"the policy nearest {fraction:g} is the one of step {rung.step:,}: return {rung.ret:.0f}, "
@@ -124,31 +144,39 @@ class Recording:
         remedy = "" if self.recipe.folder else "; a shorter [sac] segment in the recipe keeps more policies"
         inform(f"{message}: no policy of the training is at {MEDIUM:.2f} to {MEDIUM_AT_MOST}{remedy}")
 
-    def policy(self, rung: Rung | None) -> Policy | FunctionPolicy:
-        """Return the policy that plays a part."""
+    def _policy(self, rung: Rung | None) -> Policy | FunctionPolicy:
         if self.own_policy is not None:
             return self.own_policy.policy
         if rung is not None:
             return self.ladder.load(rung)
         return uniform(*self.bounds, self.observation_space.shape[0], self.recipe.env_id)
 
-    def episodes(self, part: Part, rung: Rung | None, count: int, index: int) -> Iterator[Episode]:
-        """Yield a part's episodes with exactly `count` transitions; the last one is cut short."""
-        if part.source == "replay":
+    def episodes(self) -> Iterator[Episode]:
+        """Yield the episodes of all parts, in order; the last one of each part is cut short at its count."""
+        for index in range(len(self.parts)):
+            yield from self._part_episodes(index)
+
+    def _part_episodes(self, index: int) -> Iterator[Episode]:
+        count = self.counts[index]
+        if self.parts[index].source == "replay":
             expected = self.ladder.info.medium_replay.sha256
             yield from cut_at(load_replay(self.ladder.replay, expected, self.observation_space, *self.bounds), count)
             return
         with (
-            Rollouts(self.spec, 0 if self.calls_function else self.workers) as rollouts,
+            Rollouts(self.env_spec, 0 if self.calls_function else self.workers) as rollouts,
             # the part is in the seed, so that both halves of medium-expert have their own episodes
             contextlib.closing(
-                rollouts.episodes(self.policy(rung), self.seed, (index,), transitions_needed=count)
+                rollouts.episodes(self._policy(self.rungs[index]), self.seed, (index,), transitions_needed=count)
             ) as endless,
         ):
             yield from cut_at(endless, count)
 
-    def origin_text(self, part: Part, rung: Rung | None) -> str:
-        """Return how a part was recorded, for the dataset's description."""
+    @property
+    def origin(self) -> str:
+        """How the parts are recorded, for the dataset's description."""
+        return ", then ".join(map(self._part_origin, self.parts, self.rungs))
+
+    def _part_origin(self, part: Part, rung: Rung | None) -> str:
         if part.source == "uniform":
             return "uniform-random actions"
         if self.own_policy is not None:
@@ -163,19 +191,23 @@ class Recording:
         fraction = self.ladder.fraction(rung)
         return f"SAC's policy of training step {rung.step}, at {fraction:.2f} of the expert's return"
 
-    def describe(self, part: Part, rung: Rung | None, count: int) -> JsonObject:
-        """Return a part's definition as measured, for the metadata."""
-        described: JsonObject = {"source": part.source, "transitions": count}
+    @property
+    def definitions(self) -> list[JsonObject]:
+        """The definition of each part as measured, for the metadata."""
+        return list(map(self._definition, self.parts, self.rungs, self.counts))
+
+    def _definition(self, part: Part, rung: Rung | None, count: int) -> JsonObject:
+        definition: JsonObject = {"source": part.source, "transitions": count}
         if part.source == "replay":
             medium = self.ladder.info.levels["medium"]
-            return described | {"training_steps": medium, "sha256": self.ladder.info.medium_replay.sha256}
+            return definition | {"training_steps": medium, "sha256": self.ladder.info.medium_replay.sha256}
         if self.own_policy is not None:
-            made = {"policy": self.own_policy.source, "algorithm": self.own_policy.algorithm}
-            return described | made | {"policy_sha256": self.own_policy.sha256}
+            origin = {"policy": self.own_policy.source, "algorithm": self.own_policy.algorithm}
+            return definition | origin | {"policy_sha256": self.own_policy.sha256}
         if rung is None:
             random = self.references["random"]
-            return described | {"return": random["return"], "interval": [random["low"], random["high"]]}
-        return described | {
+            return definition | {"return": random["return"], "interval": [random["low"], random["high"]]}
+        return definition | {
             "rung": rung.step,
             "return": rung.ret,
             "interval": [rung.low, rung.high],
@@ -187,7 +219,7 @@ class Recording:
 
 
 def cut_at(episodes: Iterator[Episode], count: int) -> Iterator[Episode]:
-    """Yield episodes until they hold exactly `count` transitions; the last one is truncated where it must be."""
+    """Yield episodes until they have exactly `count` transitions; truncate the last one if necessary."""
     left = count
     for episode in episodes:
         yield episode.cut(left)
