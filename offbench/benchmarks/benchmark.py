@@ -1,6 +1,6 @@
 """`benchmark`: a whole grid, from missing datasets to the score table; it resumes wherever it was stopped.
 
-grid -> plan: runs, expected hours, disk (offbench.benchmarks.plan)
+grid -> plan: runs, expected hours and disk space (offbench.benchmarks.plan)
      -> missing datasets are recorded
      -> a shard's runs -> Training (offbench.training.train) -> an executor
 """
@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from offbench.benchmarks.datasets import record_source
-from offbench.benchmarks.grid import Source
-from offbench.benchmarks.plan import Benchmark, Plan, is_longer, prepare, shard_of
+from offbench.benchmarks.datasets import record_dataset
+from offbench.benchmarks.grid import GridDataset
+from offbench.benchmarks.plan import Benchmark, is_longer, prepare, shard_of, write_plan
 from offbench.common.errors import OffbenchError
 from offbench.training.jobs import raise_first, run_jobs
 from offbench.training.spec import Job
@@ -25,7 +25,7 @@ UNITS = {"s": 1, "m": 60, "h": 3600}
 class Executor(Protocol):
     """Where recordings and trainings happen."""
 
-    def record(self, sources: Sequence[Source], workers: int) -> None:
+    def record(self, datasets: Sequence[GridDataset], workers: int) -> None:
         """Record datasets. Raises OffbenchError if one cannot be recorded."""
         ...
 
@@ -40,11 +40,11 @@ class LocalExecutor:
     def __init__(self, deadline: float | None = None) -> None:
         self.deadline = deadline
 
-    def record(self, sources: Sequence[Source], workers: int) -> None:
+    def record(self, datasets: Sequence[GridDataset], workers: int) -> None:
         """Record datasets, one after the other, until the deadline."""
-        for source in sources:
+        for dataset in datasets:
             if self.deadline is None or time.time() < self.deadline:
-                record_source(source, workers)
+                record_dataset(dataset, workers)
 
     def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
         """Train jobs, up to `processes` at a time."""
@@ -80,9 +80,7 @@ def benchmark(
     deadline = time.time() + _seconds(budget) if budget else None
     executor = executor or LocalExecutor(deadline)
     bench = prepare(grid) if isinstance(grid, str) else grid
-    plan = Plan(bench, shard)
-    for line in plan:
-        say(line)
+    update_seconds = write_plan(bench, shard, say)
     executor.record(bench.missing(), bench.machine.workers)
     if bench.missing():
         return False  # out of time
@@ -90,7 +88,7 @@ def benchmark(
     training = Training(specs, bench.machine, command=command)
     for line in training.diverged:  # in an earlier call, which raised for it
         say(line)
-    raise_first(training.run(executor.train, deadline=deadline, cost=plan.update_seconds))
+    raise_first(training.run(executor.train, deadline=deadline, cost=update_seconds))
     return not training.unfinished_jobs()
 
 

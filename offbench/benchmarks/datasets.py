@@ -7,7 +7,7 @@ import shlex
 import time
 from collections.abc import Iterator
 
-from offbench.benchmarks.grid import Source
+from offbench.benchmarks.grid import GridDataset
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
 from offbench.data import minari_store
@@ -20,47 +20,52 @@ from offbench.envs.recipes import Recipe, load_recipe
 WAIT = 5.0  # seconds between two checks of a dataset that another process records
 
 
-def record_source(source: Source, workers: int) -> None:
+def record_dataset(dataset: GridDataset, workers: int) -> None:
     """Record a grid's dataset, or wait for the process that records it. Raises OffbenchError if it cannot be."""
-    while source.id not in minari_store.local_ids():
+    while dataset.id not in minari_store.local_ids():
         try:
             collect(
-                source.env, source.level, steps=source.steps, seed=source.seed, workers=workers, dataset_id=source.id
+                dataset.env,
+                dataset.level,
+                steps=dataset.steps,
+                seed=dataset.seed,
+                workers=workers,
+                dataset_id=dataset.id,
             )
         except OffbenchError:
             # another process records it, or has just finished
-            if not minari_store.being_recorded(source.id) and source.id not in minari_store.local_ids():
+            if not minari_store.being_recorded(dataset.id) and dataset.id not in minari_store.local_ids():
                 raise
             time.sleep(WAIT)
 
 
-def check_recorded(source: Source) -> None:
+def check_recorded(dataset: GridDataset) -> None:
     """Check that a grid's dataset can be recorded or, if it exists already, is the one that the grid would record.
 
     Raises:
         OffbenchError: its id names no level of an environment that has a recipe, or it has another environment,
             level, seed or size.
     """
-    exists = minari_store.exists(source.id)
-    if not exists and not source.env:
+    exists = minari_store.exists(dataset.id)
+    if not exists and not dataset.env:
         raise OffbenchError(
-            f"{source.id} is neither a local dataset nor a level of an environment with a recipe; record or download "
+            f"{dataset.id} is neither a local dataset nor a level of an environment with a recipe; record or download "
             "it, or give its env and level in the grid"
         )
-    if not exists or not source.env:
+    if not exists or not dataset.env:
         return
-    recipe = load_recipe(source.env)
-    if differences := list(_differences(minari_store.read_metadata(source.id), source, recipe)):
-        steps = f" --steps {source.steps}" if source.steps else ""
-        seed = f" --seed {source.seed}" if source.seed else ""
+    recipe = load_recipe(dataset.env)
+    if differences := list(_differences(minari_store.read_metadata(dataset.id), dataset, recipe)):
+        steps = f" --steps {dataset.steps}" if dataset.steps else ""
+        seed = f" --seed {dataset.seed}" if dataset.seed else ""
         raise OffbenchError(
-            f"the local dataset {source.id} does not match the grid: it has {', '.join(differences)}; record it "
-            f"again (`offbench collect {shlex.quote(source.env)} --level {source.level}{steps}{seed} --id {source.id} "
-            "--overwrite`), or give in the grid another id, or the level, seed and steps of this dataset"
+            f"the local dataset {dataset.id} does not match the grid: it has {', '.join(differences)}; record it "
+            f"again (`offbench collect {shlex.quote(dataset.env)} --level {dataset.level}{steps}{seed} --id "
+            f"{dataset.id} --overwrite`), or give in the grid another id, or the level, seed and steps of this dataset"
         )
 
 
-def _differences(metadata: JsonObject, source: Source, recipe: Recipe) -> Iterator[str]:
+def _differences(metadata: JsonObject, dataset: GridDataset, recipe: Recipe) -> Iterator[str]:
     spec = metadata.get("eval_env_spec") or metadata.get("env_spec")
     if spec and not same_environment(spec, without_margin(recipe.env_spec())[0]):
         env_id = json.loads(spec)["id"]
@@ -68,15 +73,15 @@ def _differences(metadata: JsonObject, source: Source, recipe: Recipe) -> Iterat
             f", not {recipe.env_id}" if env_id != recipe.env_id else " with other settings"
         )
     provenance = minari_store.provenance(metadata)
-    if provenance.level is not None and _level_name(provenance.level) != _level_name(source.level):
-        yield f"level {provenance.level}, not {source.level}"
+    if provenance.level is not None and _level_name(provenance.level) != _level_name(dataset.level):
+        yield f"level {provenance.level}, not {dataset.level}"
     if provenance.contact_margin not in (None, recipe.contact_margin):
         yield f"contact_margin {provenance.contact_margin}, not {recipe.contact_margin}"
-    if provenance.seed not in (None, source.seed):
-        yield f"seed {provenance.seed}, not {source.seed}"
-    _, parts = parse_level(source.level)
-    if source.steps or parts[0].source != "replay":  # a replay is as long as its training
-        steps = source.steps or full_size(parts, recipe.dataset_steps)
+    if provenance.seed not in (None, dataset.seed):
+        yield f"seed {provenance.seed}, not {dataset.seed}"
+    _, parts = parse_level(dataset.level)
+    if dataset.steps or parts[0].source != "replay":  # a replay is as long as its training
+        steps = dataset.steps or full_size(parts, recipe.dataset_steps)
         if metadata.get(minari_store.KEY) and metadata.get("total_steps", steps) != steps:
             yield f"{metadata['total_steps']:,} transitions, not {steps:,}"
 

@@ -31,11 +31,11 @@ from offbench.data.levels import env_and_level, level_argument, parse_level, rec
 from offbench.envs.recipes import load_recipe
 from offbench.training.spec import TrainingSchedule
 
-LONGEST_LABEL = 60
+MAX_LABEL_LENGTH = 60
 
 
 @dataclass(frozen=True)
-class Source:
+class GridDataset:
     """A dataset of a grid, and how it is recorded if it is missing.
 
     Attributes:
@@ -51,7 +51,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Entry:
+class GridAlgorithm:
     """An algorithm of a grid with its settings (each value of a list is a variant) and its schedule.
 
     Attributes:
@@ -71,8 +71,8 @@ class Grid:
     """A whole benchmark."""
 
     name: str
-    datasets: tuple[Source, ...]
-    entries: tuple[Entry, ...]
+    datasets: tuple[GridDataset, ...]
+    algorithms: tuple[GridAlgorithm, ...]
 
 
 def grids() -> Path:
@@ -101,12 +101,12 @@ def load_grid(name: str) -> Grid:
             values = tomllib.loads(read_text(path))
     except FileNotFoundError:
         raise OffbenchError(f"no grid file {path}; shipped grids: {', '.join(shipped_grids())}") from None
-    sources = _list(values.pop("datasets", []), "datasets", where)
+    named = _list(values.pop("datasets", []), "datasets", where)
     entries = _list(values.pop("algorithms", []), "algorithms", where)
     schedule = _schedule(values, TrainingSchedule(), where)
-    datasets = tuple(_source(value, path.parent, where) for value in sources)
-    ids = [source.id for source in datasets]
-    return Grid(path.stem, datasets, tuple(_entry(value, schedule, ids, path.parent, where) for value in entries))
+    datasets = tuple(_dataset(value, path.parent, where) for value in named)
+    ids = [dataset.id for dataset in datasets]
+    return Grid(path.stem, datasets, tuple(_algorithm(value, schedule, ids, path.parent, where) for value in entries))
 
 
 def _list(value: object, key: str, where: str) -> list[object]:
@@ -129,29 +129,29 @@ def _schedule(values: JsonObject, default: TrainingSchedule, where: str) -> Trai
     return build(TrainingSchedule, merged | {"seeds": tuple(seeds)}, where)
 
 
-def _source(value: object, folder: Path, where: str) -> Source:
+def _dataset(value: object, folder: Path, where: str) -> GridDataset:
     """Return a dataset from its id or a table, which may leave out what the id names; `folder` is the grid's."""
     if not isinstance(value, dict | str):
         raise OffbenchError(f"{where}: datasets must be ids or tables, not {short_repr(value)}")
-    source = build(Source, {"id": value} if isinstance(value, str) else value, f"{where}: datasets")
-    minari_store.check_id(source.id)
-    named = level_argument(env_and_level(source.id)[1])
-    if source.env:
-        beside = folder / source.env
-        env = str(beside) if source.env.endswith(".toml") and beside.is_file() else source.env
-        level = source.level or named or "medium"
+    dataset = build(GridDataset, {"id": value} if isinstance(value, str) else value, f"{where}: datasets")
+    minari_store.check_id(dataset.id)
+    named = level_argument(env_and_level(dataset.id)[1])
+    if dataset.env:
+        beside = folder / dataset.env
+        env = str(beside) if dataset.env.endswith(".toml") and beside.is_file() else dataset.env
+        level = dataset.level or named or "medium"
     else:
-        env, level = _recipe_of(source.id)
-        level = source.level or level
-    if not env and source != Source(source.id):
-        raise OffbenchError(f"{where}: {source.id} needs env, the recipe that its level, steps and seed belong to")
+        env, level = _recipe_of(dataset.id)
+        level = dataset.level or level
+    if not env and dataset != GridDataset(dataset.id):
+        raise OffbenchError(f"{where}: {dataset.id} needs env, the recipe that its level, steps and seed belong to")
     if level:
         name, _ = parse_level(level)
         if named and name != parse_level(named)[0]:
             raise OffbenchError(
-                f"{where}: the id {source.id} names the level {named}, not {level}; give it another id"
+                f"{where}: the id {dataset.id} names the level {named}, not {level}; give it another id"
             )
-    return dataclasses.replace(source, env=env, level=level)
+    return dataclasses.replace(dataset, env=env, level=level)
 
 
 def _recipe_of(dataset_id: str) -> tuple[str, str]:
@@ -167,16 +167,18 @@ def _recipe_of(dataset_id: str) -> tuple[str, str]:
     return env, level
 
 
-def _entry(value: object, schedule: TrainingSchedule, ids: Sequence[str], folder: Path, where: str) -> Entry:
+def _algorithm(
+    value: object, schedule: TrainingSchedule, ids: Sequence[str], folder: Path, where: str
+) -> GridAlgorithm:
     if not isinstance(value, dict) or not isinstance(value.get("name"), str):
         raise OffbenchError(f"{where}: each of [[algorithms]] needs a name")
     own = {field.name for field in dataclasses.fields(TrainingSchedule)}
     entry = f"{where}: {value['name']}"
     changed = _schedule({key: item for key, item in value.items() if key in own}, schedule, entry)
     label = value.get("label", "")
-    if not isinstance(label, str) or len(label) > LONGEST_LABEL or not label.isprintable():
+    if not isinstance(label, str) or len(label) > MAX_LABEL_LENGTH or not label.isprintable():
         raise OffbenchError(
-            f"{entry}: label must be a line of at most {LONGEST_LABEL} characters, not {short_repr(label)}"
+            f"{entry}: label must be a line of at most {MAX_LABEL_LENGTH} characters, not {short_repr(label)}"
         )
     patterns = value.get("datasets", ["*"])
     for pattern in _list(patterns, "datasets", entry):
@@ -189,4 +191,4 @@ def _entry(value: object, schedule: TrainingSchedule, ids: Sequence[str], folder
     name = value["name"]
     beside = folder / name  # an algorithm's file may be named from the grid's folder
     file = ".py" in name and beside.with_suffix(".py").is_file()
-    return Entry(str(beside) if file else name, settings, changed, datasets, label)
+    return GridAlgorithm(str(beside) if file else name, settings, changed, datasets, label)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from offbench.analysis.methods import method_of
 from offbench.benchmarks.datasets import check_recorded
-from offbench.benchmarks.grid import Grid, Source, load_grid
+from offbench.benchmarks.grid import Grid, GridDataset, load_grid
 from offbench.benchmarks.throughput import Rate, measure, operations, step_seconds
 from offbench.common.errors import OffbenchError
 from offbench.common.progress import duration
@@ -24,14 +24,14 @@ from offbench.training.devices import Machine, pick_machine
 from offbench.training.run import Run
 from offbench.training.spec import RunSpec, settings_json, specs_of
 
-# operations a second assumed of a large GPU where none can be measured: a seventh of an H100's 67 Tflop/s, as the
-# products of a stack are small
+# operations a second that are assumed for a large GPU if there is none to measure: a seventh of an H100's 67 Tflop/s,
+# because the products of a stack are small
 GPU_SPEED = 1e13
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A grid on a machine: what `Plan` describes and `benchmark` runs.
+    """A grid on a machine.
 
     Attributes:
         variants: the runs of each algorithm with one combination of settings, on all its datasets.
@@ -40,17 +40,16 @@ class Benchmark:
     grid: Grid
     variants: tuple[tuple[RunSpec, ...], ...]
     machine: Machine
-    precision: str = "float32"
 
     def started(self) -> list[Run]:
         """Return the grid's runs that have a folder; the folder of all runs may hold those of other grids too."""
         runs = [spec.run for variant in self.variants for spec in variant]
         return [run for run in runs if run.config_path.exists()]
 
-    def missing(self) -> list[Source]:
+    def missing(self) -> list[GridDataset]:
         """Return the datasets that are not recorded yet."""
         local = set(minari_store.local_ids())
-        return [source for source in self.grid.datasets if source.id not in local]
+        return [dataset for dataset in self.grid.datasets if dataset.id not in local]
 
 
 def prepare(
@@ -75,11 +74,11 @@ def prepare(
         OffbenchError: anything wrong in it.
     """
     read = load_grid(grid)
-    datasets = [source.id for source in read.datasets]
+    datasets = [dataset.id for dataset in read.datasets]
     env_spec = load_recipe(env).env_spec() if env is not None else None
     variants = [
         variant
-        for entry in read.entries
+        for entry in read.algorithms
         for variant in specs_of(
             entry.algorithm,
             entry.settings,
@@ -93,12 +92,12 @@ def prepare(
     ]
     folders = [spec.folder for variant in variants for spec in variant]
     if len(set(datasets)) < len(datasets):
-        raise OffbenchError(f"{read.name}: a dataset comes twice")
+        raise OffbenchError(f"{read.name}: a dataset is listed twice")
     if len(set(folders)) < len(folders):
-        raise OffbenchError(f"{read.name}: an algorithm with the same settings comes twice")
-    for source in read.datasets:
-        check_recorded(source)
-    return Benchmark(read, tuple(variants), pick_machine(device, workers, stack, precision), precision)
+        raise OffbenchError(f"{read.name}: an algorithm with the same settings is listed twice")
+    for dataset in read.datasets:
+        check_recorded(dataset)
+    return Benchmark(read, tuple(variants), pick_machine(device, workers, stack, precision))
 
 
 def shard_of(bench: Benchmark, shard: tuple[int, int]) -> list[list[RunSpec]]:
@@ -124,110 +123,119 @@ def is_longer(spec: RunSpec) -> bool:
     return spec.run.newest_checkpoint() > spec.steps
 
 
-class Plan:
-    """The lines of a plan: a grid's size, and the cost of its unfinished runs here. A finished grid is not measured.
+@dataclass(frozen=True)
+class Cost:
+    """What a line of a plan costs on this machine.
 
     Attributes:
-        update_seconds: seconds per update of one run, evaluations included, of each algorithm in the lines so far.
-
-    Args:
-        shard: (i, n): of the i-th of n shares of the runs only.
+        disk: bytes.
+        products: floating-point operations in matrix products, counted on a CPU only.
     """
 
-    def __init__(self, bench: Benchmark, shard: tuple[int, int] = (0, 1)) -> None:
-        self.bench, self.shard = bench, shard
-        self.update_seconds: dict[str, float] = {}
+    seconds: float
+    disk: float
+    products: float = 0.0
 
-    def __iter__(self) -> Iterator[str]:
-        bench, (index, count) = self.bench, self.shard
-        shares = shard_of(bench, self.shard)
-        longer = sum(is_longer(spec) for share in shares for spec in share)
-        left = [[spec for spec in share if not _is_done(spec)] for share in shares]
-        sizes = {
-            "dataset": len(bench.grid.datasets),
-            "variant": len(bench.variants),
-            "run": sum(map(len, bench.variants)),
-        }
-        text = ", ".join(counted(size, noun) for noun, size in sizes.items())
-        by_shard = f" by shard {index}/{count}" if count > 1 else ""
-        yield f"{bench.grid.name}: {text}, {sum(map(len, left))} to train{by_shard}"
-        if longer:
-            yield f"  left as they are: {counted(longer, 'run')} with more updates than the grid's steps"
-        if not any(left):
-            return
-        env_specs = {source.env: load_recipe(source.env).env_spec() for source in bench.grid.datasets if source.env}
-        chosen = bench.variants[0][0].env_spec
-        env_specs = {"": chosen} if chosen else env_specs or {"": _recorded_env_spec(bench.grid.datasets[0])}
-        env_spec = next(iter(env_specs.values()))  # for the shapes, which differ little
-        step_time = float(np.mean([step_seconds(text) for text in env_specs.values()]))
-        self._seconds = self._disk = self._products = 0.0  # of the lines so far
-        to_train = [specs for specs in left if specs]
-        names = _names(to_train)
-        widths = max(map(len, names)), max(len(f"{specs[0].steps:,}") for specs in to_train)
-        for name, specs in zip(names, to_train, strict=True):
-            yield self._variant(specs, env_spec, step_time, f"{name:<{widths[0]}}", widths[1])
-        if missing := bench.missing():
-            yield self._recording(missing, env_spec, step_time)
-        yield from self._total()
 
-    def _variant(self, specs: Sequence[RunSpec], env_spec: str, step_time: float, name: str, width: int) -> str:
-        spec, machine, runs = specs[0], self.bench.machine, len(specs)
-        rate = measure(spec, env_spec, machine.device)
-        run_seconds = _cost(spec, rate, step_time, env_spec)
-        self.update_seconds[spec.algorithm] = run_seconds / spec.steps
-        left = sum(1 - spec.run.newest_checkpoint() / spec.steps for spec in specs)  # of a whole run each
-        cost = left * run_seconds / machine.processes
-        self._seconds += cost
-        self._disk += 2 * rate.bytes_per_run * runs
-        if machine.device == "cpu":
-            self._products += left * spec.steps * operations(spec, env_spec)
-        size = f"{counted(runs, 'run'):>9} x {spec.steps:>{width},} updates"
-        return f"  {name}{size} at {rate.updates:>5,.0f}/s: {duration(cost)}"
+def write_plan(
+    bench: Benchmark, shard: tuple[int, int] = (0, 1), say: Callable[[str], None] = print
+) -> dict[str, float]:
+    """Measure what a grid's unfinished runs cost here, and write a line about each variant as soon as it is measured.
 
-    def _recording(self, missing: Sequence[Source], env_spec: str, step_time: float) -> str:
-        steps = sum(_size(source) for source in missing)
-        self._seconds += steps * step_time / self.bench.machine.workers
-        self._disk += steps * _bytes_per_step(env_spec)
-        return f"  to record first: {', '.join(source.id for source in missing)} ({steps:,} transitions)"
+    Args:
+        shard: (i, n): only the i-th of n shares of the runs.
+        say: receives each line.
 
-    def _total(self) -> Iterator[str]:
-        machine = self.bench.machine
-        cpu = machine.device == "cpu"
-        processes = "one process" if machine.processes == 1 else f"{machine.processes} processes"
-        where = f"{processes} of one thread" if cpu else machine.device
-        yield (f"  on {where} about {duration(self._seconds)}, {self._disk / 1e9:.1f} GB of disk (measured just now)")
-        if cpu:
-            yield (
-                f"  on a GPU: not measured here; {self._products:.2g} operations in matrix products, which take "
-                f"{duration(self._products / GPU_SPEED)} if it does {GPU_SPEED / 1e12:.0f} Tflop/s of them"
-            )
+    Returns:
+        Seconds per update of one run, evaluations included, by algorithm; empty if all runs are finished.
+    """
+    shares, (index, count) = shard_of(bench, shard), shard
+    longer = sum(is_longer(spec) for share in shares for spec in share)
+    to_train = [specs for share in shares if (specs := [spec for spec in share if not _is_done(spec)])]
+    runs = sum(map(len, bench.variants))
+    sizes = {"dataset": len(bench.grid.datasets), "variant": len(bench.variants), "run": runs}
+    text = ", ".join(counted(size, noun) for noun, size in sizes.items())
+    by_shard = f" by shard {index}/{count}" if count > 1 else ""
+    say(f"{bench.grid.name}: {text}, {sum(map(len, to_train))} to train{by_shard}")
+    if longer:
+        say(f"  left as they are: {counted(longer, 'run')} with more updates than the grid's steps")
+    if not to_train:
+        return {}
+    env_spec, step_time = _environment(bench)
+    names = _names(to_train)
+    name_width, steps_width = max(map(len, names)), max(len(f"{specs[0].steps:,}") for specs in to_train)
+    costs, update_seconds = [], {}
+    for name, specs in zip(names, to_train, strict=True):
+        spec, rate = specs[0], measure(specs[0], env_spec, bench.machine.device)
+        run_seconds = _run_seconds(spec, rate, step_time, env_spec)
+        update_seconds[spec.algorithm] = run_seconds / spec.steps
+        cost = _variant_cost(specs, rate, run_seconds, env_spec, bench.machine)
+        size = f"{counted(len(specs), 'run'):>9} x {spec.steps:>{steps_width},} updates"
+        say(f"  {name:<{name_width}}{size} at {rate.updates:>5,.0f}/s: {duration(cost.seconds)}")
+        costs.append(cost)
+    if missing := bench.missing():
+        steps = sum(_size(dataset) for dataset in missing)
+        say(f"  to record first: {', '.join(dataset.id for dataset in missing)} ({steps:,} transitions)")
+        costs.append(Cost(steps * step_time / bench.machine.workers, steps * _bytes_per_step(env_spec)))
+    for line in _totals(costs, bench.machine):
+        say(line)
+    return update_seconds
+
+
+def _environment(bench: Benchmark) -> tuple[str, float]:
+    """Return the EnvSpec of an environment of the grid, for the shapes, and the seconds of a step in all of them."""
+    env_specs = {dataset.env: load_recipe(dataset.env).env_spec() for dataset in bench.grid.datasets if dataset.env}
+    chosen = bench.variants[0][0].env_spec
+    env_specs = {"": chosen} if chosen else env_specs or {"": _recorded_env_spec(bench.grid.datasets[0])}
+    step_time = float(np.mean([step_seconds(env_spec) for env_spec in env_specs.values()]))
+    return next(iter(env_specs.values())), step_time  # the shapes differ little
+
+
+def _variant_cost(specs: Sequence[RunSpec], rate: Rate, run_seconds: float, env_spec: str, machine: Machine) -> Cost:
+    left = sum(1 - spec.run.newest_checkpoint() / spec.steps for spec in specs)  # number of whole runs
+    products = left * specs[0].steps * operations(specs[0], env_spec) if machine.device == "cpu" else 0.0
+    return Cost(left * run_seconds / machine.processes, 2 * rate.bytes_per_run * len(specs), products)
+
+
+def _totals(costs: Sequence[Cost], machine: Machine) -> Iterator[str]:
+    cpu = machine.device == "cpu"
+    processes = "one process" if machine.processes == 1 else f"{machine.processes} processes"
+    where = f"{processes} of one thread" if cpu else machine.device
+    seconds, disk = sum(cost.seconds for cost in costs), sum(cost.disk for cost in costs)
+    yield f"  on {where} about {duration(seconds)}, {disk / 1e9:.1f} GB of disk (measured just now)"
+    if cpu:
+        products = sum(cost.products for cost in costs)
+        yield (
+            f"  on a GPU: not measured here; {products:.2g} operations in matrix products, which take "
+            f"{duration(products / GPU_SPEED)} if it does {GPU_SPEED / 1e12:.0f} Tflop/s of them"
+        )
 
 
 def _is_done(spec: RunSpec) -> bool:
     return spec.run.finished(spec.steps) or spec.run.diverged or is_longer(spec)
 
 
-def _cost(spec: RunSpec, rate: Rate, step_time: float, env_spec: str) -> float:
+def _run_seconds(spec: RunSpec, rate: Rate, step_time: float, env_spec: str) -> float:
     """Return the seconds of one run: its updates and its evaluations, full-length episodes assumed."""
     length = time_limit(parse_spec(env_spec)) or 1000
     episodes = -(-spec.steps // spec.eval_every) * spec.eval_episodes
     return spec.steps / rate.updates + episodes * length * step_time
 
 
-def _recorded_env_spec(source: Source) -> str:
-    spec = evaluation_spec(minari_store.read_metadata(source.id))
+def _recorded_env_spec(dataset: GridDataset) -> str:
+    spec = evaluation_spec(minari_store.read_metadata(dataset.id))
     if spec is None:
-        raise OffbenchError(f"{source.id} names no environment: give one to evaluate in with --env RECIPE")
-    untrusted_env(spec, source.id).close()
+        raise OffbenchError(f"{dataset.id} names no environment: give one to evaluate in with --env RECIPE")
+    untrusted_env(spec, dataset.id).close()
     return spec
 
 
-def _size(source: Source) -> int:
+def _size(dataset: GridDataset) -> int:
     """Return about how many transitions a dataset to be recorded will have."""
-    if source.steps or not source.env:
-        return source.steps or 0
-    _, parts = parse_level(source.level)
-    return full_size(parts, load_recipe(source.env).dataset_steps)
+    if dataset.steps or not dataset.env:
+        return dataset.steps or 0
+    _, parts = parse_level(dataset.level)
+    return full_size(parts, load_recipe(dataset.env).dataset_steps)
 
 
 def _bytes_per_step(env_spec: str) -> int:

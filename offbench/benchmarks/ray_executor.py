@@ -26,8 +26,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from offbench.benchmarks.datasets import record_source
-from offbench.benchmarks.grid import Source
+from offbench.benchmarks.datasets import record_dataset
+from offbench.benchmarks.grid import GridDataset
 from offbench.common.errors import OffbenchError
 from offbench.common.files import write_bytes
 from offbench.common.processes import environment
@@ -87,7 +87,7 @@ class RayExecutor:
         """The cluster's processors."""
         return int(self.ray.cluster_resources().get("CPU", 1))
 
-    def record(self, sources: Sequence[Source], workers: int) -> None:
+    def record(self, sources: Sequence[GridDataset], workers: int) -> None:
         """Record datasets, a task each. Raises OffbenchError for the first that failed."""
         task = self.ray.remote(**self._options)(_record)
         with _token(minari_store.root()) as token:
@@ -280,20 +280,20 @@ def _train_groups(job: Job, report: Callable[[int, str], None]) -> list[str]:
     return [line for group in groups for line in train_job(replace(job, specs=tuple(group)), report)]
 
 
-def _record(source: Source, datasets: str, token: str, server: ActorHandle) -> tuple[bool, list[str]]:
+def _record(source: GridDataset, datasets: str, token: str, server: ActorHandle) -> tuple[bool, list[str]]:
     """A task: record a dataset."""
     return _task(lambda: _record_here(source, datasets, token, server), source.id)
 
 
-def _record_here(source: Source, datasets: str, token: str, server: ActorHandle) -> list[str]:
+def _record_here(source: GridDataset, datasets: str, token: str, server: ActorHandle) -> list[str]:
     import ray
 
     if _shared(token):
         os.environ["MINARI_DATASETS_PATH"] = datasets
-        record_source(source, workers=1)
+        record_dataset(source, workers=1)
         return []
     with _own_folder():
-        record_source(source, workers=1)
+        record_dataset(source, workers=1)
         ray.get(server.replace.remote(f"{datasets}/{source.id}", read_folder(minari_store.path_of(source.id))))
     return []
 

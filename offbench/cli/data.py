@@ -35,7 +35,7 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
         metavar="POLICY",
         help="record this policy instead of a level: agent.zip (SB3), a run, a policy file, or module:function",
     )
-    parser.add_argument("--name", help="with --policy: the level in the dataset's id (default: the policy's name)")
+    parser.add_argument("--name", help="with --policy: level name in the dataset id (default: the policy's name)")
     parser.add_argument("--steps", type=positive_int, help="transitions (default: the whole level, usually 1,000,000)")
     parser.add_argument("--seed", type=non_negative_int, default=0, help="seed of the episodes (default: 0)")
     parser.add_argument("--workers", type=positive_int, help="recording processes (default: one per core)")

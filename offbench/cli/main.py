@@ -22,7 +22,7 @@ from offbench.training.failures import describe_failure
 COMMANDS: dict[str, dict[str, Command]] = {
     "Data": {
         "collect": Command(
-            "record a dataset of a level: random, medium, expert, ...",
+            "record a dataset at a level: random, medium, expert, ...",
             data.collect_arguments,
             [
                 "collect hopper --level medium",

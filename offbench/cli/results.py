@@ -24,7 +24,7 @@ from offbench.common.terminal import is_terminal, note, print_line, print_lines,
 from offbench.common.text import counted
 
 EPISODE_OPTIONS = {"env", "episodes", "stochastic", "workers"}  # options of `evaluate` without --similarity
-SIMILARITY_OPTIONS = {"algorithm", "tolerance", "action_tolerance"}  # and with it
+SIMILARITY_OPTIONS = {"algorithm", "tolerance", "action_tolerance"}  # options of `evaluate` with --similarity
 RUNS_HELP = "folder of the runs (default: runs)"
 STEPS_HELP = "score the runs as they were after N updates (default: at their last evaluations)"
 
@@ -35,7 +35,8 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
 
     parser.add_argument("returns", nargs="*", type=number, metavar="RETURN", help="returns to score, with --env")
     complete_with(
-        parser.add_argument("--env", metavar="ENV", help="shipped environment or recipe file of the returns"), recipes
+        parser.add_argument("--env", metavar="ENV", help="environment of the returns: a shipped one or a recipe file"),
+        recipes,
     )
     parser.add_argument("--runs", default="runs", metavar="DIR", help=RUNS_HELP)
     parser.add_argument("--steps", type=positive_int, metavar="N", help=STEPS_HELP)

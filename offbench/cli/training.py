@@ -31,7 +31,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     """Add the arguments of `train`."""
     from offbench.training.registry import algorithm_names
 
-    algorithm, named = _algorithm(words)
+    algorithm, named_settings = _find_algorithm(words)
     names = ", ".join(algorithm_names())
     argument = parser.add_argument("algorithm", metavar="ALGO", help=f"one of {names}, or ./FILE.py:CLASS")
     complete_with(argument, algorithm_names)
@@ -40,13 +40,13 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     )
     complete_with(dataset, local_datasets)
     _environment(parser)
-    parser.add_argument("--download", action="store_true", help="first download missing datasets from Minari's server")
+    parser.add_argument("--download", action="store_true", help="download missing datasets from Minari's server first")
     parser.add_argument(
         "--seeds",
         type=seed_list,
         default=[0],
         metavar="LIST",
-        help="seeds to run: 3, 0,1,2 or 0:5 (0 to 4) (default: 0)",
+        help="seeds: a list (0,1,2) or a range (0:5 is 0 to 4; default: 0)",
     )
     parser.add_argument("--steps", type=positive_int, default=1_000_000, help="updates (default: 1,000,000)")
     parser.add_argument(
@@ -74,8 +74,8 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
 
         settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
         rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
-        rest["algorithm"], settings = algorithm, named | settings
-        if "precision" in named:  # which is in the names of methods, but no setting
+        rest["algorithm"], settings = algorithm, named_settings | settings
+        if "precision" in named_settings:  # which is in the names of methods, but no setting
             (rest["precision"],) = settings.pop("precision")
         if reserved := RESERVED_SETTINGS & settings.keys():
             raise unknown(f"setting of {algorithm}", min(reserved), fields(config))
@@ -96,7 +96,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
     parser.set_defaults(run=run)
 
 
-def _algorithm(words: list[str]) -> tuple[str | None, dict[str, Any]]:
+def _find_algorithm(words: list[str]) -> tuple[str | None, dict[str, Any]]:
     """Return the algorithm, the first word that is neither a flag nor a flag's value, and the settings in its name.
 
     A method's name from a table is understood: `bdb (beta=0.5)` is bdb with beta 0.5.
@@ -109,6 +109,10 @@ def _algorithm(words: list[str]) -> tuple[str | None, dict[str, Any]]:
             pairs = [part.partition("=") if "=" in part else ("beta", "=", part) for part in parts]
             return name, {key: [value] for key, _, value in pairs}
     return None, {}
+
+
+def _print(line: str) -> None:
+    print_lines([line])
 
 
 def _environment(parser: Parser) -> None:
@@ -134,7 +138,7 @@ def _machine(parser: Parser) -> None:
         "--precision",
         default="float32",
         metavar="TYPE",
-        help="type of matrix products: float32, tf32 (GPUs), bfloat16 (GPUs, some CPUs) (default: float32)",
+        help="precision of matrix multiplications: float32, tf32 (GPUs) or bfloat16 (default: float32)",
     )
     parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the runs (default: runs)")
     add_trust_flag(parser)
@@ -150,7 +154,7 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
     parser.add_argument("--plan", action="store_true", help="print the runs, their time and disk space, and exit")
     parser.add_argument("--budget", metavar="TIME", help="write checkpoints and stop after this time: 90s, 9m or 2h")
     parser.add_argument(
-        "--shard", type=shard, default=(0, 1), metavar="I/N", help="train share I of N, counted from 0"
+        "--shard", type=shard, default=(0, 1), metavar="I/N", help="train only part I of N; I is from 0 to N-1"
     )
     parser.add_argument(
         "--executor",
@@ -173,23 +177,23 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
         **arguments: Any,
     ) -> None:
         from offbench.analysis import normalize
-        from offbench.benchmarks.plan import Plan, prepare
+        from offbench.benchmarks.plan import prepare, write_plan
 
         if address and executor != "ray":
             raise OffbenchError("--address needs --executor ray")
         if plan:
-            print_lines(Plan(prepare(**arguments), shard))
+            write_plan(prepare(**arguments), shard, _print)
             return
         command = shlex.join(["offbench", "benchmark", *words])
-        where = None
+        ray_executor = None
         if executor == "ray":
             from offbench.benchmarks.ray_executor import RayExecutor
 
-            where = RayExecutor(address)
-            arguments["workers"] = arguments["workers"] or where.cpus
+            ray_executor = RayExecutor(address)
+            arguments["workers"] = arguments["workers"] or ray_executor.cpus
         bench = prepare(**arguments)
         finished = offbench.benchmark(
-            bench, budget=budget, shard=shard, executor=where, say=lambda line: print_lines([line]), command=command
+            bench, budget=budget, shard=shard, executor=ray_executor, say=_print, command=command
         )
         if rows := normalize.score_some(bench.started()):  # a small budget ends before there are any
             print_scores(rows)

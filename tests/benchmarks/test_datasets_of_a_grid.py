@@ -14,7 +14,7 @@ import offbench
 from offbench.agents.behaviour import behaviour
 from offbench.agents.ladder import find_ladder, read_ladder
 from offbench.benchmarks.datasets import check_recorded
-from offbench.benchmarks.grid import Grid, Source, load_grid
+from offbench.benchmarks.grid import Grid, GridDataset, load_grid
 from offbench.benchmarks.plan import prepare
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
@@ -39,7 +39,7 @@ AGAIN = r"record it again \(`offbench collect .* --overwrite`\)"
 def test_a_grids_dataset_must_be_what_the_grid_would_record(
     medium: str, tiny: tuple[str, str], changes: dict[str, object], message: str
 ) -> None:
-    source = dataclasses.replace(Source(medium, tiny[0], "medium"), **changes)  # type: ignore[arg-type]
+    source = dataclasses.replace(GridDataset(medium, tiny[0], "medium"), **changes)  # type: ignore[arg-type]
     if not message:
         check_recorded(source)
         return
@@ -52,7 +52,7 @@ def test_a_grids_dataset_must_have_the_recipes_contact_margins(medium: str, tiny
     recipe.parent.mkdir()
     recipe.write_text('contact_margin = "sum"\n' + Path(tiny[0]).read_text())
     with pytest.raises(OffbenchError, match="it has contact_margin max, not sum"):
-        check_recorded(Source(medium, str(recipe), "medium"))
+        check_recorded(GridDataset(medium, str(recipe), "medium"))
 
 
 def test_a_shipped_grid_is_not_run_on_a_small_dataset_of_the_same_id(capsys: pytest.CaptureFixture[str]) -> None:
@@ -74,9 +74,9 @@ def test_others_datasets_are_taken_as_they_are(medium: str, tiny: tuple[str, str
     metadata = json.loads(path.read_text())
     del metadata["offbench"]
     path.write_text(json.dumps(metadata))
-    check_recorded(Source(medium, tiny[0], "expert", 10))
+    check_recorded(GridDataset(medium, tiny[0], "expert", 10))
     with pytest.raises(OffbenchError, match="environment InvertedPendulum-v5, not Hopper-v5"):
-        check_recorded(Source(medium, "hopper", "medium"))
+        check_recorded(GridDataset(medium, "hopper", "medium"))
 
 
 def test_a_recipe_does_not_take_a_shipped_ones_name(home: Path) -> None:
@@ -183,5 +183,5 @@ def test_an_id_that_contradicts_its_table_is_refused(dataset: str, message: str,
 
 def test_a_recorded_blend_is_used_by_its_id(home: Path) -> None:
     name = offbench.collect("inverted-pendulum", mix="random:0.5,expert:0.5", steps=200, workers=1)
-    assert grid_of(f'"{name}"').datasets == (Source(name),)
+    assert grid_of(f'"{name}"').datasets == (GridDataset(name),)
     assert prepare("./mine.toml").missing() == []

@@ -9,11 +9,11 @@ import pytest
 import offbench
 from offbench.analysis.results import read_results
 from offbench.benchmarks.benchmark import benchmark
-from offbench.benchmarks.plan import Plan, prepare
+from offbench.benchmarks.plan import prepare
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.training.run import find_runs
-from tests.benchmarks.test_benchmark import GRID
+from tests.benchmarks.test_benchmark import GRID, plan_lines
 
 
 def silent(_: str) -> None:
@@ -37,13 +37,13 @@ def test_runs_with_more_updates_than_the_grid_are_left_as_they_are(medium: str, 
     run = next(run for run in find_runs(home / "runs") if run.config().seed == 2)
     run.mark_diverged(5, "actor.flat")
     (run.folder / "checkpoint-000000100.safetensors").rename(run.folder / "checkpoint-000000050.safetensors")
-    assert next(iter(Plan(prepare("./short.toml", workers=1)))).endswith("5 runs, 0 to train")
+    assert plan_lines(prepare("./short.toml", workers=1))[0].endswith("5 runs, 0 to train")
 
 
 def test_the_plan_of_a_shard_is_of_its_runs(medium: str, home: Path) -> None:
     (home / "grid.toml").write_text(GRID.replace("DATASET", medium))
     bench = prepare("./grid.toml", workers=1)
-    firsts = [next(iter(Plan(bench, (i, 3)))) for i in range(3)]
+    firsts = [plan_lines(bench, (i, 3))[0] for i in range(3)]
     sizes = "grid: 1 dataset, 3 variants, 4 runs"
     assert firsts == [f"{sizes}, {count} to train by shard {i}/3" for i, count in enumerate((2, 1, 1))]
 
