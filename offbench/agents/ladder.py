@@ -25,7 +25,7 @@ from offbench.common.settings import read_back
 from offbench.common.terminal import inform, warn
 from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import same_environment
-from offbench.envs.margin_rule import EARLIER
+from offbench.envs.margin_rule import MAX_RULE
 from offbench.envs.recipes import Recipe, load_recipe, names
 from offbench.envs.version_warning import warn_other_physics
 from offbench.rollouts.policy import Policy, load_policy
@@ -77,7 +77,7 @@ class LadderInfo:
     references: dict[str, dict[str, int | float]]
     levels: dict[str, int]
     medium_replay: Replay
-    contact_margin: str = EARLIER
+    contact_margin: str = MAX_RULE
     env_code: dict[str, str] = field(default_factory=dict)
     seed: int = 0
     steps: int = 0

@@ -52,7 +52,7 @@ from offbench.common.seeds import Purpose
 from offbench.common.terminal import warn
 from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import Env, make_env
-from offbench.envs.margin_rule import EARLIER
+from offbench.envs.margin_rule import MAX_RULE
 from offbench.envs.recipes import Recipe, SACSettings
 from offbench.rollouts.policy import Policy
 from offbench.rollouts.rollouts import MEASURES, ErrorReporting, Rollouts, summary
@@ -100,7 +100,7 @@ def _check_identity(folder: TrainingFolder) -> None:
         raise OffbenchError(
             f"the training in {folder.path} began in other code of its environment: {edited}; delete it to train again"
         )
-    recorded = {"contact_margin": EARLIER} | recorded  # the only rule of earlier versions
+    recorded = {"contact_margin": MAX_RULE} | recorded  # the only rule of earlier versions
     started = _flattened({key: value for key, value in recorded.items() if key in identity})
     wanted = _flattened(json.loads(json.dumps(identity)))
     changed = [key for key in started | wanted if started.get(key) != wanted.get(key)]

@@ -23,7 +23,7 @@ from offbench.data.minari_reader import open_minari
 from offbench.data.other_references import warn_other_references
 from offbench.data.recording import POLICY, WITHOUT_AGENT, Recording
 from offbench.envs.environment_code import environment_code
-from offbench.envs.margin_rule import EARLIER, LAST_EARLIER, MARGIN, MUJOCO_VERSIONS, without_margin
+from offbench.envs.margin_rule import LAST_WITH_MAX_RULE, MARGIN_KEY, MAX_RULE, MUJOCO_VERSIONS, without_margin
 from offbench.envs.recipes import load_recipe
 from offbench.envs.version_warning import same_physics
 from offbench.rollouts.rollouts import Episode
@@ -173,8 +173,8 @@ def _metadata(recording: Recording, dataset_id: str, level: str) -> JsonObject:
     mujoco, margins = f"mujoco=={made['mujoco']}", ""
     if recording.has_margins:
         margins = f" Contact margins as in MuJoCo {MUJOCO_VERSIONS[recipe.contact_margin]}: see offbench.make_env."
-        if recipe.contact_margin == EARLIER and same_physics(LAST_EARLIER, made["mujoco"], recording.env_spec):
-            mujoco = f"mujoco<={LAST_EARLIER}"
+        if recipe.contact_margin == MAX_RULE and same_physics(LAST_WITH_MAX_RULE, made["mujoco"], recording.env_spec):
+            mujoco = f"mujoco<={LAST_WITH_MAX_RULE}"
     short = f" A short recording: {total:,} of {full:,} transitions." if total < full else ""
     if recording.own_policy:
         algorithm = recording.own_policy.algorithm
@@ -204,7 +204,7 @@ def _metadata(recording: Recording, dataset_id: str, level: str) -> JsonObject:
             "full_size": full,
             "references": references,
             "d4rl": recipe.d4rl_reference(),
-            MARGIN: recipe.contact_margin if recording.uses_mujoco else None,
+            MARGIN_KEY: recipe.contact_margin if recording.uses_mujoco else None,
             **({"env_code": code} if (code := environment_code(recording.env_spec)) else {}),
             "versions": made,
         },

@@ -45,7 +45,7 @@ from offbench.envs.environments import (
     time_limit,
     untrusted_env,
 )
-from offbench.envs.margin_rule import ADDED, MARGIN, without_margin
+from offbench.envs.margin_rule import MARGIN_KEY, SUM_RULE, without_margin
 from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference, load_recipe, names
 from offbench.rollouts.rollouts import Episode
 
@@ -337,10 +337,10 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
         if before and not same_environment(before, origin.evaluated):
             warn(f"--env names another environment than {source.path} does, so its reference scores are left out")
             metadata = {key: value for key, value in metadata.items() if key not in ("ref_min_score", "ref_max_score")}
-            ours = {key: value for key, value in ours.items() if key not in ("references", MARGIN)}
+            ours = {key: value for key, value in ours.items() if key not in ("references", MARGIN_KEY)}
             ours["d4rl"] = d4rl_reference(metadata["eval_env_spec"])
-        if rule == ADDED:
-            ours[MARGIN] = rule
+        if rule == SUM_RULE:
+            ours[MARGIN_KEY] = rule
         metadata[minari_store.KEY] = ours
     return metadata, _spaces(source, origin.recipe)
 

@@ -27,7 +27,7 @@ from offbench.common.files import (
 from offbench.common.scores import are_references
 from offbench.common.settings import read_back, setting
 from offbench.data.levels import parse_level, recipe_and_level
-from offbench.envs.margin_rule import ADDED, EARLIER
+from offbench.envs.margin_rule import MAX_RULE, SUM_RULE
 from offbench.envs.recipes import load_recipe
 
 with warnings.catch_warnings():
@@ -59,7 +59,7 @@ class Provenance:
     full_size: int | None = None
     references: JsonObject = field(default_factory=dict)
     d4rl: tuple[float, float] | None = None
-    contact_margin: str | None = setting(None, "", choices=(EARLIER, ADDED))
+    contact_margin: str | None = setting(None, "", choices=(MAX_RULE, SUM_RULE))
     env_code: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     content_sha256: str | None = None

@@ -13,7 +13,7 @@ from offbench.common.terminal import inform
 from offbench.data import minari_store
 from offbench.envs import environments
 from offbench.envs.environments import Env, untrusted_env
-from offbench.envs.margin_rule import ADDED, EARLIER, MUJOCO_VERSIONS, with_margin
+from offbench.envs.margin_rule import MAX_RULE, MUJOCO_VERSIONS, SUM_RULE, with_margin
 from offbench.envs.recipes import load_recipe, names
 
 CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d{1,6})(?:\.(\d{1,6}))?")  # of a requirement: `>=3.1.0,<3.2.0` has two
@@ -44,7 +44,7 @@ def make_env(name: str | Path, render_mode: str | None = None) -> Env:
 def evaluation_spec(metadata: JsonObject) -> str | None:
     """Return the environment to evaluate a dataset's policies in, as EnvSpec JSON; None if it names none."""
     spec = metadata.get("eval_env_spec") or metadata.get("env_spec")
-    return with_margin(spec, recorded_margin(metadata) or EARLIER) if spec else None
+    return with_margin(spec, recorded_margin(metadata) or MAX_RULE) if spec else None
 
 
 def recorded_margin(metadata: JsonObject) -> str | None:
@@ -52,14 +52,14 @@ def recorded_margin(metadata: JsonObject) -> str | None:
     ours = minari_store.provenance(metadata)
     recorded = "versions" in (metadata.get(minari_store.KEY) or {})  # by offbench, first with the earlier rule alone
     if ours.contact_margin or recorded:
-        return ours.contact_margin or EARLIER
+        return ours.contact_margin or MAX_RULE
     demands = (CLAUSE.findall(item) for item in _requirements(metadata) if re.match(r"\s*mujoco\b(?!-)", item))
     for operator, major, minor in itertools.chain.from_iterable(demands):
         version = (int(major), int(minor or 0))
         if operator in ("==", "~=", ">=", ">") and version >= (3, 5):
-            return ADDED
+            return SUM_RULE
         if (operator in ("==", "<=") and version < (3, 5)) or (operator == "<" and version <= (3, 5)):
-            return EARLIER
+            return MAX_RULE
     return None
 
 
@@ -89,9 +89,9 @@ def margins_matter(env_spec: str) -> bool:
 def report_margin_rule(dataset_id: str, metadata: JsonObject, env_spec: str) -> None:
     """Print the contact-margin rule of a dataset's environment (EnvSpec JSON), unless it is the default or unused."""
     rule = recorded_margin(metadata)
-    if rule == EARLIER or not margins_matter(env_spec):
+    if rule == MAX_RULE or not margins_matter(env_spec):
         return
-    since, installed = MUJOCO_VERSIONS[rule or EARLIER], versions()["mujoco"]
+    since, installed = MUJOCO_VERSIONS[rule or MAX_RULE], versions()["mujoco"]
     message = f"{dataset_id}: contact margins as in MuJoCo {since} (installed is {installed})"
     if rule is None:
         message += f"; its metadata do not tell, `offbench verify {dataset_id}` finds out"

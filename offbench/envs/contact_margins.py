@@ -28,7 +28,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.terminal import warn
-from offbench.envs.margin_rule import ADDED, EARLIER, MUJOCO_VERSIONS
+from offbench.envs.margin_rule import MAX_RULE, MUJOCO_VERSIONS, SUM_RULE
 
 SUMMED_SINCE, GAP_OUTSIDE_SINCE, RK4_ROTATIONS_SINCE = (3, 5), (3, 9), (4, 0)
 ROUNDING = 1e-12  # of a sum of two margins, in the model's unit of length
@@ -47,10 +47,10 @@ def set_contacts(model: mujoco.MjModel, rule: str, name: str) -> None:
         name: the model's name in a warning.
     """
     here = release(mujoco.__version__)
-    if rule == (ADDED if here >= SUMMED_SINCE else EARLIER):
+    if rule == (SUM_RULE if here >= SUMMED_SINCE else MAX_RULE):
         return
     combine: Callable[[Array, Array], Array]
-    if rule == EARLIER:
+    if rule == MAX_RULE:
         combine, solve, gaps_inside = np.maximum, _summands, -1 if here >= GAP_OUTSIDE_SINCE else 0
     else:
         combine, solve, gaps_inside = np.add, _upper_bounds, 1
@@ -75,7 +75,7 @@ def has_margins(model: mujoco.MjModel) -> bool:
 @functools.cache
 def _warn_once(name: str, rule: str) -> None:
     if multiprocessing.parent_process() is None:  # a worker's parent has made the same environment
-        remedy = "mujoco<3.5" if rule == EARLIER else "mujoco>=3.5"
+        remedy = "mujoco<3.5" if rule == MAX_RULE else "mujoco>=3.5"
         warn(
             f"{name}: no contact margins on MuJoCo {mujoco.__version__} give the contacts of "
             f"versions {MUJOCO_VERSIONS[rule]}, so the model keeps its own; for those, install '{remedy}'"

@@ -24,7 +24,7 @@ from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError, rendering_variable
 from offbench.common.files import is_exhausted
 from offbench.common.terminal import warn
-from offbench.envs.margin_rule import EARLIER, MARGIN, without_margin
+from offbench.envs.margin_rule import MARGIN_KEY, MAX_RULE, without_margin
 from offbench.envs.trust import check_code
 
 Env: TypeAlias = gym.Env[Array, Array]
@@ -260,7 +260,7 @@ def _identity(spec: Mapping[str, Any]) -> tuple[object, ...]:
     if isinstance(wrappers, list):
         named = [(w.get("name"), w.get("kwargs") or {}) if isinstance(w, dict) else (w, {}) for w in wrappers]
         wrappers = [wrapper for wrapper in named if str(wrapper[0]) not in PASSIVE_WRAPPERS]
-    return spec.get("id"), kwargs, spec.get("max_episode_steps"), wrappers, spec.get(MARGIN, EARLIER)
+    return spec.get("id"), kwargs, spec.get("max_episode_steps"), wrappers, spec.get(MARGIN_KEY, MAX_RULE)
 
 
 def reason(error: BaseException) -> str:

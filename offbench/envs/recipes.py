@@ -22,7 +22,7 @@ from offbench.common.files import damage, read_text
 from offbench.common.scores import are_references
 from offbench.common.settings import build, setting, short_repr
 from offbench.envs.environments import PASSIVE_WRAPPERS, RENDERING_ARGUMENTS, env_spec
-from offbench.envs.margin_rule import ADDED, EARLIER, with_margin
+from offbench.envs.margin_rule import MAX_RULE, SUM_RULE, with_margin
 
 T = TypeVar("T")
 
@@ -70,7 +70,7 @@ class Recipe:
     d4rl_min: float | None = setting(None, "D4RL's reference score of a random policy")
     d4rl_max: float | None = setting(None, "D4RL's reference score of an expert")
     contact_margin: str = setting(
-        EARLIER, "contact margins of MuJoCo before 3.5 (max) or since (sum)", choices=(EARLIER, ADDED)
+        MAX_RULE, "contact margins of MuJoCo before 3.5 (max) or since (sum)", choices=(MAX_RULE, SUM_RULE)
     )
     replay_envs: int | None = setting(
         None, "environments of SAC's training that medium-replay keeps (default: all)", low=1
@@ -98,7 +98,7 @@ class Recipe:
     def sha256(self) -> str:
         """Return the SHA-256 of the recipe's values, which its layout and comments do not affect."""
         values = {k: v for k, v in dataclasses.asdict(self).items() if k != "folder"}
-        for name, default in (("contact_margin", EARLIER), ("replay_envs", None)):
+        for name, default in (("contact_margin", MAX_RULE), ("replay_envs", None)):
             if values[name] == default:
                 del values[name]  # settings of later versions: earlier hashes stay valid
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

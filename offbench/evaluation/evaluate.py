@@ -19,7 +19,7 @@ from offbench.common.terminal import warn
 from offbench.common.text import counted
 from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import checked_spec, env_spec, same_environment
-from offbench.envs.margin_rule import ADDED, MUJOCO_VERSIONS, without_margin
+from offbench.envs.margin_rule import MUJOCO_VERSIONS, SUM_RULE, without_margin
 from offbench.envs.recipes import d4rl_reference, load_recipe
 from offbench.envs.trust import REMEDY, is_trusting
 from offbench.evaluation.policies import load_policy
@@ -99,7 +99,9 @@ def evaluate(
         references = {"dataset": shipped_references(spec), "d4rl": d4rl_reference(spec)}
     scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in references.items() if pair}
     physics = (
-        f" with contact margins as in MuJoCo {MUJOCO_VERSIONS[ADDED]}" if without_margin(spec)[1] == ADDED else ""
+        f" with contact margins as in MuJoCo {MUJOCO_VERSIONS[SUM_RULE]}"
+        if without_margin(spec)[1] == SUM_RULE
+        else ""
     )
     return Evaluation(str(path), env_id, returns, [episode.length for episode in episode_stats], scores, physics)
 

@@ -25,7 +25,7 @@ from offbench.data.file_stamps import unchanged
 from offbench.data.minari_reader import RecordedEpisode, episodes_of, open_minari, reading
 from offbench.data.recorded_env import margins_matter, recorded_margin, recorded_mujoco
 from offbench.envs.environments import box, same_bounds, untrusted_env
-from offbench.envs.margin_rule import ADDED, EARLIER, MUJOCO_VERSIONS, with_margin
+from offbench.envs.margin_rule import MAX_RULE, MUJOCO_VERSIONS, SUM_RULE, with_margin
 from offbench.rollouts.rollouts import Rollouts, result
 from offbench.verification.findings import Findings, Report
 from offbench.verification.metadata import check_recorded_metadata
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 EPISODES = 300  # replayed by default: half a minute for a million transitions
 RULE_EPISODES = 10  # about how many are replayed under both rules for contact margins if the metadata name none
-REQUIREMENT = {EARLIER: "mujoco<3.5", ADDED: "mujoco>=3.5"}
+REQUIREMENT = {MAX_RULE: "mujoco<3.5", SUM_RULE: "mujoco>=3.5"}
 MIN_TERMINATIONS = 3  # fewest terminations that are a fault if all are at the time limit
 FEW_STEPS = 20_000  # up to this many steps are replayed without worker processes
 
@@ -157,13 +157,13 @@ def _replay(
                 rule: sum(bool(v.faults) for v in replay(with_margin(spec, rule), some)) for rule in MUJOCO_VERSIONS
             }
             rule = min(off, key=off.__getitem__)
-            if off[EARLIER] != off[ADDED]:
+            if off[MAX_RULE] != off[SUM_RULE]:
                 report.warnings.append(
                     f"recorded with the contact margins of MuJoCo {MUJOCO_VERSIONS[rule]}, as "
                     f"{counted(len(some), 'episode')} show, and its metadata do not tell: add {REQUIREMENT[rule]!r} "
                     "to its requirements, so that policies are evaluated with them"
                 )
-        replays = replay(with_margin(spec, rule or EARLIER), episodes_of(data, names))
+        replays = replay(with_margin(spec, rule or MAX_RULE), episodes_of(data, names))
     _add_replays(replays, made if exact else None, report, findings)
 
 

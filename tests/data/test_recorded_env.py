@@ -20,7 +20,7 @@ from offbench.data import minari_store
 from offbench.data.recorded_env import recorded_margin
 from offbench.envs.contact_margins import SUMMED_SINCE, release
 from offbench.envs.environments import env_spec
-from offbench.envs.margin_rule import ADDED, EARLIER, with_margin, without_margin
+from offbench.envs.margin_rule import MAX_RULE, SUM_RULE, with_margin, without_margin
 from offbench.rollouts.policy import load_policy
 from offbench.verification.verify import verify
 
@@ -29,8 +29,8 @@ with warnings.catch_warnings():
     import minari
     from minari.data_collector import EpisodeBuffer
 
-ITS_OWN, OTHER = (ADDED, EARLIER) if release(mujoco.__version__) >= SUMMED_SINCE else (EARLIER, ADDED)
-MARGIN = {ADDED: "mujoco>=3.5", EARLIER: "mujoco<3.5"}
+ITS_OWN, OTHER = (SUM_RULE, MAX_RULE) if release(mujoco.__version__) >= SUMMED_SINCE else (MAX_RULE, SUM_RULE)
+MARGIN = {SUM_RULE: "mujoco>=3.5", MAX_RULE: "mujoco<3.5"}
 
 
 def record_theirs(name: str, requirements: list[str] | None) -> list[EpisodeBuffer]:
@@ -85,11 +85,11 @@ def test_a_dataset_recorded_without_offbench_has_its_own_physics(capsys: pytest.
             np.testing.assert_array_equal(env.step(action)[0], observation)
     run = train("theirs-v0")
     said = capsys.readouterr().err
-    assert ("MuJoCo 3.5 and later" in said) == (ITS_OWN == ADDED)
+    assert ("MuJoCo 3.5 and later" in said) == (ITS_OWN == SUM_RULE)
     wanted = played_by_gymnasium(run / "policy.safetensors", 3)
     evaluation = offbench.evaluate(run, episodes=3, workers=1)
     np.testing.assert_allclose(evaluation.returns, wanted, rtol=1e-12)
-    assert ("MuJoCo 3.5 and later" in evaluation.lines()[0]) == (ITS_OWN == ADDED)
+    assert ("MuJoCo 3.5 and later" in evaluation.lines()[0]) == (ITS_OWN == SUM_RULE)
     # under the other rule the same policy has other returns
     config = json.loads((run / "config.json").read_text())
     config["env_spec"] = with_margin(config["env_spec"], OTHER)
@@ -117,19 +117,19 @@ def test_where_no_version_is_recorded_verify_finds_the_margins(capsys: pytest.Ca
     ("metadata", "rule"),
     [
         ({}, None),
-        ({"requirements": ["mujoco==3.4.0", "gymnasium>=1"]}, EARLIER),
-        ({"requirements": ["gymnasium>=4", "mujoco == 3.10.0"]}, ADDED),
-        ({"requirements": ["mujoco>=3.1.0,<3.2.0"]}, EARLIER),
+        ({"requirements": ["mujoco==3.4.0", "gymnasium>=1"]}, MAX_RULE),
+        ({"requirements": ["gymnasium>=4", "mujoco == 3.10.0"]}, SUM_RULE),
+        ({"requirements": ["mujoco>=3.1.0,<3.2.0"]}, MAX_RULE),
         ({"requirements": ["mujoco>=3.2"]}, None),
         ({"requirements": ["mujoco<4"]}, None),
-        ({"requirements": ["mujoco<3.5"]}, EARLIER),
-        ({"requirements": ["mujoco>=3.5,<5"]}, ADDED),
+        ({"requirements": ["mujoco<3.5"]}, MAX_RULE),
+        ({"requirements": ["mujoco>=3.5,<5"]}, SUM_RULE),
         ({"requirements": ["mujoco-py>=4", "mujoco_py>=4"]}, None),
         ({"requirements": "mujoco==4.0.0"}, None),
-        ({"offbench": {"versions": {}}}, EARLIER),
-        ({"offbench": {"contact_margin": "sum", "versions": {"mujoco": "3.4.0"}}}, ADDED),
-        ({"offbench": {"contact_margin": None, "versions": {"mujoco": "4.0.0"}}}, EARLIER),
-        ({"offbench": {"imported": {}}, "requirements": ["mujoco==4.0.0"]}, ADDED),
+        ({"offbench": {"versions": {}}}, MAX_RULE),
+        ({"offbench": {"contact_margin": "sum", "versions": {"mujoco": "3.4.0"}}}, SUM_RULE),
+        ({"offbench": {"contact_margin": None, "versions": {"mujoco": "4.0.0"}}}, MAX_RULE),
+        ({"offbench": {"imported": {}}, "requirements": ["mujoco==4.0.0"]}, SUM_RULE),
     ],
 )
 def test_metadata_tell_the_rule(metadata: dict[str, Any], rule: str | None) -> None:
@@ -144,16 +144,16 @@ def test_a_recipe_may_ask_for_the_rule_of_later_versions(
     offbench.collect(str(recipe), "random", steps=50, workers=1, dataset_id="added-v0")
     metadata = minari_store.read_metadata("added-v0")
     for key in ("env_spec", "eval_env_spec"):
-        assert without_margin(metadata[key]) == (metadata[key], EARLIER)  # Gymnasium's own, nothing added
-    assert metadata["offbench"]["contact_margin"] == ADDED
+        assert without_margin(metadata[key]) == (metadata[key], MAX_RULE)  # Gymnasium's own, nothing added
+    assert metadata["offbench"]["contact_margin"] == SUM_RULE
     assert minari.load_dataset("added-v0").recover_environment(eval_env=True).spec.id == "InvertedPendulum-v5"
     recipe.write_text('env_id = "Hopper-v5"\ncontact_margin = "sum"')
     margins = {
         rule: offbench.make_env(name).unwrapped.model.geom_margin.max()  # type: ignore[attr-defined]
-        for rule, name in ((ADDED, str(recipe)), (EARLIER, "hopper"))
+        for rule, name in ((SUM_RULE, str(recipe)), (MAX_RULE, "hopper"))
     }
     assert margins[ITS_OWN] == gym.make("Hopper-v5").unwrapped.model.geom_margin.max()  # type: ignore[attr-defined]
-    assert margins[ADDED] == 2 * margins[EARLIER]
+    assert margins[SUM_RULE] == 2 * margins[MAX_RULE]
     recipe.write_text('env_id = "Hopper-v5"\ncontact_margin = "both"')
     done = offbench_cli("collect", str(recipe))
     assert done.returncode == 2

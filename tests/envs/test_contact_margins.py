@@ -13,7 +13,7 @@ import pytest
 
 from offbench.envs import version_warning
 from offbench.envs.contact_margins import GAP_OUTSIDE_SINCE, SUMMED_SINCE, release, rotations_changed, set_contacts
-from offbench.envs.margin_rule import ADDED, EARLIER
+from offbench.envs.margin_rule import MAX_RULE, SUM_RULE
 from offbench.envs.recipes import load_recipe
 from tests.conftest import ROOT
 
@@ -89,12 +89,12 @@ def accelerations(model: mujoco.MjModel) -> np.ndarray:
 
 def by_hand(values: list[tuple[float, float]], rule: str) -> mujoco.MjModel:
     """Return the scene with each contact written out, margin and gap by the rule from those of its geoms."""
-    pairs, combine = "", max if rule == EARLIER else lambda a, b: a + b
+    pairs, combine = "", max if rule == MAX_RULE else lambda a, b: a + b
     for one, other in ((0, 1), (0, 2), (1, 2)):
         margin, gap = (combine(values[one][i], values[other][i]) for i in (0, 1))
-        if rule == EARLIER and HERE >= GAP_OUTSIDE_SINCE:
+        if rule == MAX_RULE and HERE >= GAP_OUTSIDE_SINCE:
             margin -= gap
-        if rule == ADDED and HERE < GAP_OUTSIDE_SINCE:
+        if rule == SUM_RULE and HERE < GAP_OUTSIDE_SINCE:
             margin += gap
         pairs += f'<pair geom1="{"abc"[one]}" geom2="{"abc"[other]}" margin="{margin}" gap="{gap}" condim="3"/>'
     none = 'contype="0" conaffinity="0"'
@@ -116,8 +116,8 @@ def test_the_larger_margin_and_gap_decide(values: list[tuple[float, float]]) -> 
     words = [f'margin="{margin}" gap="{gap}"' for margin, gap in values]
     model = mujoco.MjModel.from_xml_string(SCENE.format(*words, pairs=""))
     plain = accelerations(model)
-    set_contacts(model, EARLIER, "scene")
-    wanted = accelerations(by_hand(values, EARLIER))
+    set_contacts(model, MAX_RULE, "scene")
+    wanted = accelerations(by_hand(values, MAX_RULE))
     np.testing.assert_allclose(accelerations(model), wanted, rtol=1e-9, atol=1e-9)
     if HERE >= SUMMED_SINCE:
         assert np.abs(plain - wanted).max() > 1e-3  # MuJoCo's own rule gives something else
@@ -127,8 +127,8 @@ def test_the_larger_margin_and_gap_decide(values: list[tuple[float, float]]) -> 
 @pytest.mark.parametrize("values", [[(0.02, 0.0)] * 3, [(0.02, 0.004)] * 3, [(0.02, 0.0), (0.01, 0.0), (0.01, 0.0)]])
 def test_both_margins_together_decide_where_data_have_that_rule(values: list[tuple[float, float]]) -> None:
     model = mujoco.MjModel.from_xml_string(SCENE.format(*(f'margin="{m}" gap="{g}"' for m, g in values), pairs=""))
-    set_contacts(model, ADDED, "scene")
-    np.testing.assert_allclose(accelerations(model), accelerations(by_hand(values, ADDED)), rtol=1e-9, atol=1e-9)
+    set_contacts(model, SUM_RULE, "scene")
+    np.testing.assert_allclose(accelerations(model), accelerations(by_hand(values, SUM_RULE)), rtol=1e-9, atol=1e-9)
 
 
 def boxes(margins: list[float]) -> mujoco.MjModel:
@@ -143,11 +143,11 @@ def boxes(margins: list[float]) -> mujoco.MjModel:
 def test_margins_that_nothing_restores_are_left_alone_and_said(capsys: pytest.CaptureFixture[str]) -> None:
     margins = [0.01, 0.02, 0.03, 0.04]
     model = boxes(margins)
-    set_contacts(model, EARLIER, "four spheres")
+    set_contacts(model, MAX_RULE, "four spheres")
     assert model.geom_margin.tolist() == margins
     said = capsys.readouterr().err
     assert all(word in said for word in ("four spheres", "mujoco<3.5"))
-    set_contacts(boxes(margins), EARLIER, "four spheres")
+    set_contacts(boxes(margins), MAX_RULE, "four spheres")
     assert not capsys.readouterr().err  # once is enough
 
 
