@@ -1,4 +1,4 @@
-"""`compare`: two groups of runs, paired over datasets and seeds, with a plain verdict."""
+"""`compare`: two methods, paired over datasets and seeds, with a verdict in words."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ class Comparison:
     """A against B over the datasets and seeds that both have.
 
     Attributes:
-        a, b: the groups as selected.
-        pairs: what everything else is computed from.
+        a, b: the names of the methods.
+        pairs: the scores that everything else is computed from.
         reference: what the scores are normalized by, in words.
-        statistics: difference of A - B.
+        statistics: statistics of the difference A - B.
         chance: probability that a run of A scores above one of B, over the paired runs.
         unpaired: how many runs of either have no partner and are left out.
         windows: which evaluations are behind the scores of A's and of B's paired runs, in words.
         comparable: whether both runs of each pair are scored over evaluations at the same steps.
         unfinished: how many of the paired runs have not reached their last step, or have diverged.
         changed: the algorithms whose paired runs were trained by different code.
-        notes: settings that the groups' names leave out, and in which the runs of one group differ.
+        notes: settings that the methods' names leave out, and settings in which the runs of one method differ.
     """
 
     a: str
@@ -72,7 +72,7 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Which group is better, or that there is no evidence of a difference."""
+        """Which method is better, or that there is no evidence of a difference."""
         estimate, sizes = self.statistics.difference, Counter(pair.dataset for pair in self.pairs)
         over = f"{from_to(sizes.values())} {plural(max(sizes.values()), 'seed')}"
         over += f" on {len(sizes)} datasets" if len(sizes) > 1 else ""
@@ -80,12 +80,12 @@ class Comparison:
             return "no verdict: the scores are of evaluations at different steps"
         sign = favored(self.statistics)
         if not sign:
-            return f"no evidence of a difference at {over}"
-        return f"{self.a if sign > 0 else self.b} is better: +{estimate if sign > 0 else -estimate} at {over}"
+            return f"no evidence of a difference with {over}"
+        return f"{self.a if sign > 0 else self.b} is better: +{estimate if sign > 0 else -estimate} with {over}"
 
     @property
     def title(self) -> str:
-        """The two groups, and what the scores are normalized by."""
+        """The two methods, and what the scores are normalized by."""
         return f"{self.a} against {self.b} ({self.reference})"
 
     def table(self) -> tuple[list[str], list[list[str]]]:
@@ -153,7 +153,7 @@ class Comparison:
 
 
 def compare(a: str, b: str, *, runs: str | Path = "runs", steps: int | None = None) -> Comparison:
-    """Compare two groups of runs over the datasets and seeds that both have.
+    """Compare two methods over the datasets and seeds that both have.
 
     Args:
         a, b: the names of two methods as in tables, e.g. `td3_bc` and `bdb (beta=0.5)`; or ALGO/VARIANT, as
@@ -162,36 +162,36 @@ def compare(a: str, b: str, *, runs: str | Path = "runs", steps: int | None = No
         steps: compare the runs as they were after so many updates; shorter ones as they are.
 
     Raises:
-        OffbenchError: no such group, the two are one, or they share no dataset and seed.
+        OffbenchError: an unknown method, twice the same one, or no dataset and seed in common.
     """
     results = read_results(runs, steps=steps)
     groups = tuple(results.of(find_method(results.methods, name)) for name in (a, b))
     if groups[0] == groups[1]:
-        raise OffbenchError(f"{a} and {b} are the same runs; give two groups")
-    both = pair_runs(*groups)
-    if not both:
+        raise OffbenchError(f"{a} and {b} are the same method; give two different ones")
+    run_pairs = pair_runs(*groups)
+    if not run_pairs:
         raise OffbenchError(f"{a} and {b} share no dataset with a seed in common: there is nothing to pair")
-    tasks = {task for task, *_ in both}
+    tasks = {task for task, *_ in run_pairs}
     if len(tasks) > 1 and any(task.reference is None for task in tasks):
         raise OffbenchError(
             "a dataset without reference scores has raw returns, which do not average with other datasets' scores; "
             "give a --runs folder of one dataset"
         )
-    pairs = _scored(both)
+    pairs = _scored(run_pairs)
     unnamed = unnamed_settings(group[0].method for group in groups)
-    trained = [[one for _, one, _ in both], [other for *_, other in both]]
+    sides = [[one for _, one, _ in run_pairs], [other for *_, other in run_pairs]]
     return Comparison(
         groups[0][0].method.label,
         groups[1][0].method.label,
         pairs,
         " and ".join(sorted({REFERENCES[task.reference] for task in tasks})),
-        paired(differences(both)),
+        paired(differences(run_pairs)),
         improvement(_by_dataset(pairs, lambda pair: pair.a), _by_dataset(pairs, lambda pair: pair.b)),
-        sum(len(entry.runs) for group in groups for entry in group) - 2 * len(both),
-        (window_text(trained[0]), window_text(trained[1])),
-        comparable(both),
-        sum(t.state != "finished" for side in trained for t in side),
-        tuple(keys_with_mixed_code((t.config.algorithm, t) for side in trained for t in side)),
+        sum(len(entry.runs) for group in groups for entry in group) - 2 * len(run_pairs),
+        (window_text(sides[0]), window_text(sides[1])),
+        comparable(run_pairs),
+        sum(t.state != "finished" for side in sides for t in side),
+        tuple(keys_with_mixed_code((t.config.algorithm, t) for side in sides for t in side)),
         (
             *(f"settings of {text}" for text in unnamed),
             *differing_settings_notes(entry for group in groups for entry in group),
@@ -204,19 +204,19 @@ RunPairs = Sequence[tuple[Task, EvaluatedRun, EvaluatedRun]]
 
 def pair_runs(a: Iterable[Entry], b: Iterable[Entry]) -> RunPairs:
     """Return the runs of A and of B that have the same dataset and seed, in order of A's."""
-    others = {(entry.task, trained.seed): trained for entry in b for trained in entry.runs}
-    mine = ((entry.task, trained) for entry in a for trained in entry.runs)
+    others = {(entry.task, run.seed): run for entry in b for run in entry.runs}
+    mine = ((entry.task, run) for entry in a for run in entry.runs)
     return [(task, one, others[task, one.seed]) for task, one in mine if (task, one.seed) in others]
 
 
-def comparable(both: RunPairs) -> bool:
+def comparable(run_pairs: RunPairs) -> bool:
     """Return whether both runs of each pair are scored over evaluations at the same steps."""
-    return all(one.window == other.window for _, one, other in both)
+    return all(one.window == other.window for _, one, other in run_pairs)
 
 
-def differences(both: RunPairs) -> dict[str, list[float]]:
+def differences(run_pairs: RunPairs) -> dict[str, list[float]]:
     """Return {task: score of A's run minus score of B's, for each pair}."""
-    return _by_dataset(_scored(both), lambda pair: pair.a - pair.b)
+    return _by_dataset(_scored(run_pairs), lambda pair: pair.a - pair.b)
 
 
 def favored(statistics: Paired) -> int:
@@ -227,8 +227,8 @@ def favored(statistics: Paired) -> int:
     return 1 if low > 0 else -1
 
 
-def _scored(both: RunPairs) -> list[Pair]:
-    return [Pair(t.name, one.seed, one.score(t.reference), other.score(t.reference)) for t, one, other in both]
+def _scored(run_pairs: RunPairs) -> list[Pair]:
+    return [Pair(t.name, one.seed, one.score(t.reference), other.score(t.reference)) for t, one, other in run_pairs]
 
 
 def _by_dataset(pairs: Iterable[Pair], value: Callable[[Pair], float]) -> dict[str, list[float]]:

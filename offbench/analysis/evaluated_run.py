@@ -18,9 +18,14 @@ Key = TypeVar("Key")
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """One run with its evaluations and the rows of its losses.csv."""
+    """One run with its evaluations and losses.
 
-    run: Run
+    Attributes:
+        files: the run's folder.
+        losses: the rows of its losses.csv.
+    """
+
+    files: Run
     config: RunConfig
     evaluations: Evaluations
     losses: Sequence[Mapping[str, float]] = ()
@@ -50,7 +55,7 @@ class EvaluatedRun:
         """`finished`, `unfinished` or `diverged`."""
         if self.reached >= self.steps:
             return "finished"
-        return "diverged" if self.run.diverged else "unfinished"
+        return "diverged" if self.files.diverged else "unfinished"
 
     def up_to(self, step: int) -> EvaluatedRun:
         """Return the run as it was after `step` updates; a shorter one as it is."""
@@ -60,7 +65,7 @@ class EvaluatedRun:
             sessions=tuple(session for session in self.config.sessions if session.step < step),
         )
         evaluations = {at: episodes for at, episodes in self.evaluations.items() if at <= step}
-        return EvaluatedRun(self.run, config, evaluations, [row for row in self.losses if row["step"] <= step])
+        return EvaluatedRun(self.files, config, evaluations, [row for row in self.losses if row["step"] <= step])
 
     def score(self, reference: str | None) -> float:
         """Return the run's score by a reference that it has (None: its return)."""
@@ -79,14 +84,14 @@ class EvaluatedRun:
 def keys_with_mixed_code(runs: Iterable[tuple[Key, EvaluatedRun]]) -> list[Key]:
     """Return the keys whose runs were trained by different code of the algorithm, as far as their config.json says."""
     codes: dict[Key, set[tuple[tuple[str, str], ...]]] = {}
-    for key, trained in runs:
-        if trained.config.code:
-            codes.setdefault(key, set()).add(tuple(trained.config.code.items()))
+    for key, run in runs:
+        if run.config.code:
+            codes.setdefault(key, set()).add(tuple(run.config.code.items()))
     return [key for key, found in codes.items() if len(found) > 1]
 
 
 def window_text(runs: Iterable[EvaluatedRun]) -> str:
     """Return which evaluations are behind the scores of runs: `10 evaluations, steps 5,000 to 50,000`."""
-    windows = [trained.window for trained in runs]
+    windows = [run.window for run in runs]
     counts, ends = {len(steps) for steps in windows}, {end for steps in windows for end in (steps[0], steps[-1])}
     return f"{from_to(counts)} {plural(max(counts), 'evaluation')}, {plural(len(ends), 'step')} {from_to(ends)}"

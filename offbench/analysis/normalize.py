@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 from offbench.agents.ladder import BEHAVIOUR, folder_of, read_ladder, shipped_ladder
 from offbench.analysis.methods import Method, unnamed_settings
-from offbench.analysis.results import Entry, differing_settings_notes, entries_of, mixed_code, read_results
+from offbench.analysis.results import SHORT_HASH, Entry, differing_settings_notes, entries_of, mixed_code, read_results
 from offbench.analysis.statistics import iqm
 from offbench.common import scores
 from offbench.common.errors import OffbenchError
@@ -22,7 +22,7 @@ from offbench.common.files import JsonObject, csv_bytes
 from offbench.common.tables import latex, markdown, plain, tabular
 from offbench.common.text import aligned, compact, no_formula, printable
 from offbench.envs.recipes import load_recipe
-from offbench.training.run import DIGITS, Run, find_runs
+from offbench.training.run import Run, find_runs
 
 Row: TypeAlias = JsonObject
 FORMATS = ("table", "json", "csv", "markdown", "latex")
@@ -84,7 +84,7 @@ def _row(entry: Entry, ambiguous: bool) -> Row:
     mean_return, _ = entry.mean_std(None) or (None, None)
     row: Row = {
         "dataset": entry.task.dataset,
-        **({"content": entry.task.content[:DIGITS]} if ambiguous else {}),
+        **({"content": entry.task.content_sha256[:SHORT_HASH]} if ambiguous else {}),
         "method": entry.method.label,
         "algorithm": entry.method.algorithm,
         "variant": entry.runs[0].config.variant,
@@ -99,7 +99,7 @@ def _row(entry: Entry, ambiguous: bool) -> Row:
         mean, std = entry.mean_std(reference) or (None, None)
         row |= {column: mean, f"{column}_std": std}
         if reference == "dataset":
-            estimate = None if mean is None else iqm({"": [trained.score(reference) for trained in entry.runs]})
+            estimate = None if mean is None else iqm({"": [run.score(reference) for run in entry.runs]})
             ends = (estimate.low, estimate.high) if estimate else (None, None)
             row |= {"iqm": estimate.value if estimate else None, "iqm_low": ends[0], "iqm_high": ends[1]}
     return row

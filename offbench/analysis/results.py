@@ -27,14 +27,15 @@ from offbench.common.scores import SCORED_EVALUATIONS, mean_std
 from offbench.common.terminal import warn
 from offbench.data.levels import LEVELS, env_and_level
 from offbench.envs.environments import same_environment
-from offbench.training.run import DIGITS, Run, find_runs
+from offbench.training.run import Run, find_runs
 from offbench.training.run_config import RunConfig
 
 # the order of the BDB paper's Table 1; levels are in its order already
 ENV_ORDER = ("hopper", "walker2d", "halfcheetah")
 REFERENCES = {"dataset": "own reference", "d4rl": "D4RL's constants", None: "no reference: raw return"}
 
-LONG_CURVE = 40  # evaluations, of which more are drawn as means
+SHORT_HASH = 8  # digits of a content hash that are shown if one dataset id has several contents
+LONG_CURVE = 40  # evaluations; longer curves are drawn as means
 
 
 @dataclass(frozen=True)
@@ -42,20 +43,20 @@ class Task:
     """A dataset that runs were trained on.
 
     Attributes:
-        content: its content hash; the same id may have been recorded twice.
+        content_sha256: its content hash; the same id may have been recorded twice.
         reference: what scores are normalized by: "dataset", "d4rl" or None (raw returns).
         ambiguous: whether runs used another content under the same id.
     """
 
     dataset: str
-    content: str
+    content_sha256: str
     reference: str | None
     ambiguous: bool = False
 
     @property
     def name(self) -> str:
         """The dataset's id, with its content's first digits where the id alone is ambiguous."""
-        return f"{self.dataset} ({self.content[:DIGITS]})" if self.ambiguous else self.dataset
+        return f"{self.dataset} ({self.content_sha256[:SHORT_HASH]})" if self.ambiguous else self.dataset
 
     @property
     def env_and_level(self) -> tuple[str, str]:
@@ -74,38 +75,38 @@ class Entry:
     @property
     def scores(self) -> list[float]:
         """Each run's score by the task's reference."""
-        return [trained.score(self.task.reference) for trained in self.runs]
+        return [run.score(self.task.reference) for run in self.runs]
 
     def mean_std(self, reference: str | None) -> tuple[float, float | None] | None:
         """Return mean and deviation over seeds by a reference; None if a run lacks it."""
         if reference is not None and not all(t.config.references.get(reference) for t in self.runs):
             return None
-        return mean_std([trained.score(reference) for trained in self.runs])
+        return mean_std([run.score(reference) for run in self.runs])
 
     @property
     def reached(self) -> int:
         """The step that every run has been evaluated at or after."""
-        return min(trained.reached for trained in self.runs)
+        return min(run.reached for run in self.runs)
 
     @property
     def steps(self) -> int:
         """The largest last step of the runs."""
-        return max(trained.steps for trained in self.runs)
+        return max(run.steps for run in self.runs)
 
     @property
     def states(self) -> set[str]:
         """The states of the runs: `finished`, `unfinished`, `diverged`."""
-        return {trained.state for trained in self.runs}
+        return {run.state for run in self.runs}
 
     @property
     def evaluations(self) -> int:
         """The fewest evaluations behind a run's score."""
-        return min(len(trained.window) for trained in self.runs)
+        return min(len(run.window) for run in self.runs)
 
     @property
     def window(self) -> tuple[int, ...] | None:
         """The steps of the evaluations behind the scores; None if the runs differ."""
-        windows = {trained.window for trained in self.runs}
+        windows = {run.window for run in self.runs}
         return windows.pop() if len(windows) == 1 else None
 
     @property
@@ -121,7 +122,7 @@ class Entry:
 
     def common_curve(self) -> tuple[list[int], Array]:
         """Return the steps that all runs were evaluated at, and their scores [runs, steps]."""
-        curves = [trained.curve(self.task.reference) for trained in self.runs]
+        curves = [run.curve(self.task.reference) for run in self.runs]
         steps = sorted(set.intersection(*(set(curve) for curve in curves)))
         return steps, np.array([[curve[step] for step in steps] for curve in curves])
 
@@ -165,7 +166,7 @@ class Results:
 
     def comparable(self, task: Task) -> bool:
         """Return whether all scores of a task are of evaluations at the same steps: others must not be ranked."""
-        return len({trained.window for entry in self.on(task) for trained in entry.runs}) == 1
+        return len({run.window for entry in self.on(task) for run in entry.runs}) == 1
 
     def scores(self, method: Method) -> dict[str, list[float]]:
         """Return {task: normalized scores of its seeds}; tasks without a reference are left out."""
@@ -241,8 +242,8 @@ def entries_of(
     damaged: list[OffbenchError] = []
     for run in runs:
         try:
-            trained = EvaluatedRun(run, run.config(), run.evaluations(), run.losses())
-            trained = trained.up_to(steps) if steps is not None else trained
+            evaluated = EvaluatedRun(run, run.config(), run.evaluations(), run.losses())
+            evaluated = evaluated.up_to(steps) if steps is not None else evaluated
         except OffbenchError as error:
             damaged.append(error)
             continue
@@ -250,10 +251,10 @@ def entries_of(
             message = f"cannot read {run.folder}: {error.strerror}; {READ_REMEDIES.get(error.errno, 'try again')}"
             damaged.append(OffbenchError(message))
             continue
-        if trained.evaluations:
-            config = trained.config
+        if evaluated.evaluations:
+            config = evaluated.config
             key = (config.dataset, config.dataset_sha256, config.algorithm, config.variant)
-            groups.setdefault(key, []).append(trained)
+            groups.setdefault(key, []).append(evaluated)
         else:
             unevaluated.append(run)
     if damaged and not groups:
@@ -270,11 +271,11 @@ def entries_of(
     tasks = _tasks(groups, compared)
     configs: dict[tuple[str, str], list[RunConfig]] = {}
     for (_, _, algorithm, variant), group in groups.items():
-        configs.setdefault((algorithm, variant), []).extend(trained.config for trained in group)
+        configs.setdefault((algorithm, variant), []).extend(run.config for run in group)
     methods = name_methods(configs)
     entries = []
     for (dataset, content, algorithm, variant), group in groups.items():
-        group.sort(key=lambda trained: trained.seed)
+        group.sort(key=lambda run: run.seed)
         _check_seeds(group)
         entries.append(Entry(tasks[dataset, content], methods[algorithm, variant], tuple(group)))
     entries.sort(key=lambda entry: (_task_order(entry.task), method_order(entry.method)))
@@ -311,7 +312,7 @@ def _check_evaluated_alike(one: EvaluatedRun, other: EvaluatedRun) -> None:
     else:
         return
     raise OffbenchError(
-        f"{one.run.folder} and {other.run.folder} are runs on the same data but {differ} (see env_spec, env_code "
+        f"{one.files.folder} and {other.files.folder} are runs on the same data but {differ} (see env_spec, env_code "
         "and references in their config.json), so their scores do not compare; give a folder without one of them"
     )
 
@@ -320,11 +321,11 @@ def _check_seeds(runs: Sequence[EvaluatedRun]) -> None:
     for one, other in itertools.pairwise(runs):
         if one.seed == other.seed:
             raise OffbenchError(
-                f"{one.run.folder} and {other.run.folder} are the same run twice: one seed counts once; "
+                f"{one.files.folder} and {other.files.folder} are the same run twice: one seed counts once; "
                 "give a folder that holds each run once"
             )
 
 
 def _task_order(task: Task) -> tuple[tuple[int, str], tuple[int, str], str, str]:
     env, level = task.env_and_level
-    return rank(level, tuple(LEVELS)), rank(env, ENV_ORDER), task.dataset, task.content
+    return rank(level, tuple(LEVELS)), rank(env, ENV_ORDER), task.dataset, task.content_sha256

@@ -64,7 +64,7 @@ class Transitions:
     environment takes is `low + (actions[i] + 1) * (high - low) / 2`.
 
     Attributes:
-        content: SHA-256 over the arrays, the same as in an offbench dataset's metadata.
+        content_sha256: SHA-256 over the arrays, the same as in an offbench dataset's metadata.
         observations: [N + E, obs], the T + 1 observations of every episode, end to end.
         rows: [N], the row of each transition's observation.
         actions: [N, act], scaled from the bounds of the action space to [-1, 1].
@@ -77,7 +77,7 @@ class Transitions:
     """
 
     dataset_id: str
-    content: str
+    content_sha256: str
     observations: Array
     rows: Array
     actions: Array

@@ -14,7 +14,7 @@ from offbench.common.tables import Cell, Table
 from offbench.common.terminal import warn
 from offbench.data import minari_store, transitions
 from offbench.reports.markup import Markup, join, tag
-from offbench.reports.page import table
+from offbench.reports.page import table_html
 from offbench.reports.tables import EMPTY
 
 SHOWN = 12  # digits of a content hash, in the cards as here
@@ -24,12 +24,12 @@ def dataset_table(results: Results) -> Table:
     """Return the datasets that the runs were trained on, as their config.json names them."""
     rows = []
     for task in results.tasks:
-        runs = [trained for entry in results.on(task) for trained in entry.runs]
-        envs = sorted({trained.config.env_id for trained in runs} - {""})
+        runs = [run for entry in results.on(task) for run in entry.runs]
+        envs = sorted({run.config.env_id for run in runs} - {""})
         references = runs[0].config.references.get("dataset")
         scale = f"{references[0]:,.1f} to {references[1]:,.1f}" if references else "-"
         names = [Cell(task.dataset), Cell(", ".join(envs) or "-")]
-        rows.append([*names, *_sizes(task), Cell(scale), Cell(task.content[:SHOWN])])
+        rows.append([*names, *_sizes(task), Cell(scale), Cell(task.content_sha256[:SHOWN])])
     header = ["dataset", "environment", "transitions", "episodes", "mean return", "score 0 to 100", "content"]
     notes = [
         "“content”: the first digits of the SHA-256 over a dataset's arrays, as each run's config.json has it. Sizes "
@@ -43,14 +43,14 @@ def _sizes(task: Task) -> list[Cell]:
     """Return transitions, episodes and mean return of a dataset if it is here with the same content."""
     try:
         recorded = minari_store.provenance(minari_store.read_metadata(task.dataset)).content_sha256
-        if recorded not in (None, task.content):
+        if recorded not in (None, task.content_sha256):
             return [EMPTY] * 3  # recorded again since: not worth a conversion
         data = transitions.load(task.dataset)
     except (OffbenchError, OSError) as error:  # OSError: a name that no file system takes
         if task.dataset in minari_store.local_ids():
             warn(f"the report has no sizes of {task.dataset}: {error}")
         return [EMPTY] * 3
-    if data.content != task.content:
+    if data.content_sha256 != task.content_sha256:
         return [EMPTY] * 3
     mean = float(data.returns.mean())
     counts = [Cell(f"{count:,}", count) for count in (len(data), len(data.ends))]
@@ -76,7 +76,7 @@ def _card(env: str) -> Markup | None:
     header = ["level", "transitions", "episodes", "mean return", "std", "score", "terminated", "content"]
     made = ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
     shown = Table(f"card-{env}", f"{env} ({made})", header, rows)
-    parts = [table(shown, caption=True, download=False)]
+    parts = [table_html(shown, caption=True, download=False)]
     if picture.exists():
         data = base64.b64encode(picture.read_bytes()).decode()
         alt = f"{env}: learning curve of the behaviour agent, and the histogram of returns of each level"

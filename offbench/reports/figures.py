@@ -27,7 +27,7 @@ from offbench.reports.tables import Aggregates
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure as Canvas
+    from matplotlib.figure import Figure as MplFigure
     from matplotlib.lines import Line2D
     from matplotlib.typing import LineStyleType
 
@@ -148,34 +148,34 @@ def final_figure(entries: Sequence[Entry], styles: Mapping[Method, LineStyle], n
     )
 
 
-def iqm_figure(iqms: Aggregates, styles: Mapping[Method, LineStyle]) -> Figure:
+def iqm_figure(aggregates: Aggregates, styles: Mapping[Method, LineStyle]) -> Figure:
     """Draw every method's IQM with its interval."""
 
     def paint(axes: Axes) -> None:
-        for row, (method, (estimate, _)) in enumerate(iqms.items()):
+        for row, (method, (estimate, _)) in enumerate(aggregates.items()):
             color = styles[method].color
             if estimate.low is not None and estimate.high is not None:
                 axes.plot([estimate.low, estimate.high], [row, row], color=color, linewidth=7, alpha=0.35)
             axes.plot([estimate.value] * 2, [row - 0.3, row + 0.3], color=color, linewidth=2.5)
-        _named_rows(axes, [styles[method].label for method in iqms])
+        _named_rows(axes, [styles[method].label for method in aggregates])
         axes.set(xlabel="IQM of normalized scores")
 
-    text = ", ".join(f"{method.label} {estimate}" for method, (estimate, _) in iqms.items())
+    text = ", ".join(f"{method.label} {estimate}" for method, (estimate, _) in aggregates.items())
     caption = "Interquartile mean over all tasks and its 95% stratified bootstrap interval."
     return _draw("iqm", caption, f"Interquartile means with 95% intervals: {text}.", paint)
 
 
-def profile_figure(iqms: Aggregates, styles: Mapping[Method, LineStyle]) -> Figure:
+def profile_figure(aggregates: Aggregates, styles: Mapping[Method, LineStyle]) -> Figure:
     """Draw the performance profiles: the fraction of runs above each score."""
-    every = [value for _, scores in iqms.values() for values in scores.values() for value in values]
+    every = [value for _, scores in aggregates.values() for values in scores.values() for value in values]
     taus = np.linspace(min(0.0, min(every)), max(100.0, max(every)), PROFILE_POINTS)
 
     def paint(axes: Axes) -> None:
-        for method, (_, scores) in iqms.items():
+        for method, (_, scores) in aggregates.items():
             _band(axes, taus.tolist(), profile(scores, taus.tolist()), styles[method])
         axes.set(xlabel="normalized score τ", ylabel="fraction of runs above τ", ylim=(-0.02, 1.02))
 
-    halves = {m.label: profile(s, [50.0])[0].value for m, (_, s) in iqms.items()}
+    halves = {m.label: profile(s, [50.0])[0].value for m, (_, s) in aggregates.items()}
     text = ", ".join(f"{label} {100 * half:.0f}%" for label, half in halves.items())
     caption = "Fraction of all runs that score above τ, 95% stratified bootstrap interval shaded. Higher is better."
     return _draw("profiles", caption, f"Performance profiles. Runs above 50: {text}.", paint, list(styles.values()))
@@ -337,7 +337,7 @@ def _legend(styles: Sequence[LineStyle], most: int = 32) -> tuple[list[Line2D], 
     return [Line2D([], [], color=style.color, linestyle=style.dashes) for style in styles], names
 
 
-def _saved(fig: Canvas, kind: str) -> bytes:
+def _saved(fig: MplFigure, kind: str) -> bytes:
     data = io.BytesIO()
     # no date and no version: the same runs give the same bytes
     nothing = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None, "Format": None, "Type": None}}

@@ -64,7 +64,7 @@ def _section(section: Section) -> Markup:
     return tag("section", tag("h2", section.title), *intro, *section.content, "\n", id=section.name)
 
 
-def table(data: Table, *, caption: bool = False, download: bool = True) -> Markup:
+def table_html(data: Table, *, caption: bool = False, download: bool = True) -> Markup:
     """Return a table that sorts by a click on a column's header, with its title shown and links to its files."""
     small = data.small or [""] * len(data.header)
     head = []
@@ -114,7 +114,7 @@ def _cell(data: Table, column: int, cell: Cell) -> Markup:
     return tag("td", text, class_="number best" if cell.best else "number", data_value=value)
 
 
-def figures(group: Sequence[Figure]) -> Markup:
+def figures_html(group: Sequence[Figure]) -> Markup:
     """Return figures in a grid below one legend of all their lines."""
     styles = dict.fromkeys(style for figure in group for style in figure.legend)
     parts = []
@@ -135,7 +135,7 @@ def _legend_item(style: LineStyle) -> Markup:
     return tag("li", tag("svg", stroke, viewBox="0 0 32 10", aria_hidden="true"), breakable(style.label))
 
 
-def dialogs(results: Results) -> list[Markup]:
+def dialogs_html(results: Results) -> list[Markup]:
     """Return a dialog for every cell of the score table with the provenance of its number."""
     markup = []
     for i, task in enumerate(results.tasks):
@@ -149,14 +149,14 @@ def dialogs(results: Results) -> list[Markup]:
 def _dialog(results: Results, entry: Entry, name: str) -> Markup:
     task, first = entry.task, entry.runs[0].config
     references = [f"{REFERENCES[key]}: {pair[0]:g} to {pair[1]:g}" for key, pair in first.references.items() if pair]
-    sessions = [session for trained in entry.runs for session in trained.config.history]
+    sessions = [session for run in entry.runs for session in run.config.history]
     facts = {
-        "dataset": f"{task.dataset}, content {task.content}",
+        "dataset": f"{task.dataset}, content {task.content_sha256}",
         "references": "; ".join(references) or "none",
         "evaluation": _distinct_lines(
             [f"every {t.config.eval_every:,} updates, {t.config.eval_episodes} episodes" for t in entry.runs]
         ),
-        "commands": _distinct_lines([trained.config.command or "from Python" for trained in entry.runs]),
+        "commands": _distinct_lines([run.config.command or "from Python" for run in entry.runs]),
         "versions": _distinct_lines([_key_values(session.versions) for session in sessions]),
         "hardware": _distinct_lines([_hardware(session) for session in sessions]),
         "settings": _distinct_lines([_key_values(t.config.settings) or "none" for t in entry.runs]),
@@ -178,19 +178,17 @@ def _dialog(results: Results, entry: Entry, name: str) -> Markup:
 def _seeds(results: Results, entry: Entry) -> Markup:
     header = ["seed", "score", "return", "evaluations", "step", "folder"]
     rows = []
-    for trained in entry.runs:
-        score = trained.score(entry.task.reference)
-        step = (
-            f"{trained.reached:,}" if trained.reached >= trained.steps else f"{trained.reached:,} of {trained.steps:,}"
-        )
+    for run in entry.runs:
+        score = run.score(entry.task.reference)
+        step = f"{run.reached:,}" if run.reached >= run.steps else f"{run.reached:,} of {run.steps:,}"
         cells = [
-            str(trained.seed),
+            str(run.seed),
             f"{score:.2f}" if entry.task.reference else "-",
-            f"{run_return(trained.evaluations):.1f}",
-            str(len(trained.evaluations)),
+            f"{run_return(run.evaluations):.1f}",
+            str(len(run.evaluations)),
             step,
         ]
-        folder = tag("td", breakable(relative(results, trained.run)), class_="name")
+        folder = tag("td", breakable(relative(results, run.files)), class_="name")
         rows.append(tag("tr", *[tag("td", cell, class_="number") for cell in cells], folder))
     head = tag("thead", tag("tr", *[tag("th", text, scope="col") for text in header]))
     return tag("div", tag("table", head, tag("tbody", *rows), class_="plain"), class_="wide", tabindex=0)

@@ -20,12 +20,11 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import damage, read_bytes, write_together
 from offbench.common.tables import Table, files
 from offbench.common.text import counted, from_to, plural
-from offbench.reports import figures as draw
-from offbench.reports import tables
+from offbench.reports import figures, tables
 from offbench.reports.datasets import cards, dataset_table
 from offbench.reports.figures import Figure
 from offbench.reports.markup import Markup, join, tag
-from offbench.reports.page import Section, dialogs, figures, page, relative, table
+from offbench.reports.page import Section, dialogs_html, figures_html, page, relative, table_html
 from offbench.reports.similarity import similarity_tables
 from offbench.reports.sweep import best_table
 from offbench.reports.tables import is_papers_grid, scale
@@ -50,7 +49,7 @@ def report(
     Args:
         runs: the folder of the run directories, or several; one run is enough, unfinished ones are marked.
         out: the report's folder; an older report in it is replaced.
-        title: of the page.
+        title: title of the page.
         steps: show the runs as they were after so many updates; shorter ones as they are.
         datasets: only these, by id or by a pattern such as `hopper-*`.
         methods: only these, by their names in tables.
@@ -67,11 +66,13 @@ def report(
     results = read_results(runs, steps=steps, datasets=datasets or (), methods=methods or ())
     before = _earlier_files(folder)
     aggregates = tables.iqms(results)
-    by_name, pictures = _tables(results, aggregates), _figures(results, aggregates)
-    written = {f"tables/{one.name}.{end}": data for one in by_name.values() for end, data in files(one).items()}
-    for figure in (figure for group in pictures.values() for figure in group):
+    tables_by_name, figure_groups = _tables(results, aggregates), _figures(results, aggregates)
+    written = {f"tables/{one.name}.{end}": data for one in tables_by_name.values() for end, data in files(one).items()}
+    for figure in (figure for group in figure_groups.values() for figure in group):
         written |= {f"figures/{figure.name}.png": figure.png, f"figures/{figure.name}.svg": figure.svg}
-    content = page(title or TITLE, _lead(results), list(_sections(results, by_name, pictures)), dialogs(results))
+    content = page(
+        title or TITLE, _lead(results), list(_sections(results, tables_by_name, figure_groups)), dialogs_html(results)
+    )
     written[PAGE] = content  # written last, so that all its links exist
     write_together({folder / name: data for name, data in written.items()})
     for path in before - {folder / name for name in written}:
@@ -100,7 +101,7 @@ def _earlier_files(folder: Path) -> set[Path]:
 def _tables(results: Results, aggregates: tables.Aggregates) -> dict[str, Table]:
     all_tables = [
         *(tables.score_table(results), tables.seed_table(results), dataset_table(results), best_table(results)),
-        *(*similarity_tables(results), tables.beside_table(results)),
+        *(*similarity_tables(results), tables.published_table(results)),
         tables.iqm_table(results, aggregates) if aggregates else None,
         tables.improvement_table(results, aggregates) if len(aggregates) > 1 else None,
     ]
@@ -109,19 +110,19 @@ def _tables(results: Results, aggregates: tables.Aggregates) -> dict[str, Table]
 
 def _figures(results: Results, aggregates: tables.Aggregates) -> dict[str, list[Figure]]:
     """Return all figures by what they show."""
-    styles = draw.line_styles(results.methods)
+    styles = figures.line_styles(results.methods)
     rows = [results.on(task) for task in results.tasks]
     stems = _stems([entries[0].task.name for entries in rows])
     groups: dict[str, list[Figure]] = {"curves": [], "finals": [], "beta": [], "q": [], "iqm": []}
     for entries, stem in zip(rows, stems, strict=True):
-        groups["curves"].append(draw.curve_figure(entries, styles, f"curves-{stem}"))
-        groups["finals"].append(draw.final_figure(entries, styles, f"finals-{stem}"))
+        groups["curves"].append(figures.curve_figure(entries, styles, f"curves-{stem}"))
+        groups["finals"].append(figures.final_figure(entries, styles, f"finals-{stem}"))
         for group, column, label in (("beta", "beta", "β"), ("q", "q_abs", "mean |Q1(s, a)|")):
-            if figure := draw.loss_figure(entries, styles, f"{group}-{stem}", column, label):
+            if figure := figures.loss_figure(entries, styles, f"{group}-{stem}", column, label):
                 groups[group].append(figure)
     if aggregates:
-        groups["iqm"] = [draw.iqm_figure(aggregates, styles), draw.profile_figure(aggregates, styles)]
-    if len(results.tasks) > 1 and aggregates and (over_all := draw.iqm_curve_figure(results, styles)):
+        groups["iqm"] = [figures.iqm_figure(aggregates, styles), figures.profile_figure(aggregates, styles)]
+    if len(results.tasks) > 1 and aggregates and (over_all := figures.iqm_curve_figure(results, styles)):
         groups["curves"].append(over_all)
     return groups
 
@@ -138,15 +139,15 @@ def _stems(names: Sequence[str]) -> list[str]:
 
 def _lead(results: Results) -> Markup:
     entries = list(results.entries.values())
-    runs = [trained for entry in entries for trained in entry.runs]
+    runs = [run for entry in entries for run in entry.runs]
     seeds = {len(entry.runs) for entry in entries}
-    states = Counter(trained.state for trained in runs)
+    states = Counter(run.state for run in runs)
     counts = [
         (f"{len(runs)}", plural(len(runs), "run")),
         (f"{len(results.tasks)}", plural(len(results.tasks), "dataset")),
         (f"{len(results.methods)}", plural(len(results.methods), "method")),
         (from_to(seeds), f"{plural(max(seeds), 'seed')} per cell"),
-        (f"{sum(trained.reached for trained in runs):,}", "updates trained"),
+        (f"{sum(run.reached for run in runs):,}", "updates trained"),
     ]
     tiles = [tag("li", tag("b", value), tag("span", name)) for value, name in counts]
     counted_states = [
@@ -162,34 +163,36 @@ def _lead(results: Results) -> Markup:
 
 
 def _sections(
-    results: Results, by_name: Mapping[str, Table], pictures: Mapping[str, Sequence[Figure]]
+    results: Results, tables_by_name: Mapping[str, Table], figure_groups: Mapping[str, Sequence[Figure]]
 ) -> Iterator[Section]:
     text = "Click a number to see where it comes from: seeds, commands, versions, hardware. Click a header to sort."
-    yield Section("scores", by_name["scores"].title, [table(by_name["scores"])], text)
-    if "best" in by_name:
-        yield Section("best", by_name["best"].title, [table(by_name["best"])])
-    if "iqm" in by_name:
-        parts = [figures(pictures["iqm"]), table(by_name["iqm"])]
+    yield Section("scores", tables_by_name["scores"].title, [table_html(tables_by_name["scores"])], text)
+    if "best" in tables_by_name:
+        yield Section("best", tables_by_name["best"].title, [table_html(tables_by_name["best"])])
+    if "iqm" in tables_by_name:
+        parts = [figures_html(figure_groups["iqm"]), table_html(tables_by_name["iqm"])]
         yield Section("aggregate", "Across datasets", parts)
-    if "improvement" in by_name:
-        yield Section("improvement", "Probability of improvement", [table(by_name["improvement"])])
+    if "improvement" in tables_by_name:
+        yield Section("improvement", "Probability of improvement", [table_html(tables_by_name["improvement"])])
     text = "The BDB paper's Figure 4 shows the same for its datasets." if is_papers_grid(results) else ""
-    yield Section("curves", "Learning curves", [figures(pictures["curves"])], text)
-    yield Section("finals", "Final scores, seed by seed", [figures(pictures["finals"])])
-    if "beside" in by_name:
-        yield Section("beside", "Published scores", [table(by_name["beside"])])
-    if "similarity" in by_name:
-        more = tag("details", tag("summary", "Both readings"), table(by_name["similarity-details"]))
-        yield Section("similarity", by_name["similarity"].title, [table(by_name["similarity"]), more])
-    if pictures["beta"]:
+    yield Section("curves", "Learning curves", [figures_html(figure_groups["curves"])], text)
+    yield Section("finals", "Final scores, seed by seed", [figures_html(figure_groups["finals"])])
+    if "beside" in tables_by_name:
+        yield Section("beside", "Published scores", [table_html(tables_by_name["beside"])])
+    if "similarity" in tables_by_name:
+        more = tag("details", tag("summary", "Both readings"), table_html(tables_by_name["similarity-details"]))
+        yield Section(
+            "similarity", tables_by_name["similarity"].title, [table_html(tables_by_name["similarity"]), more]
+        )
+    if figure_groups["beta"]:
         text = "BDB's weight of the discriminator against cloning: 0 is TD3+BC, 1 the discriminator alone."
-        yield Section("beta", "Beta over training", [figures(pictures["beta"])], text)
-    if pictures["q"]:
+        yield Section("beta", "Beta over training", [figures_html(figure_groups["beta"])], text)
+    if figure_groups["q"]:
         text = "Mean |Q1| on the dataset's own actions. A diverging critic shows here before it shows in the score."
-        yield Section("critic", "Critic over training", [figures(pictures["q"])], text)
-    yield Section("datasets", "Datasets", [table(by_name["datasets"]), *_shipped(results)])
-    summary = f"Show {counted(len(by_name['seeds'].rows), 'run')}"
-    every = tag("details", tag("summary", summary), table(by_name["seeds"]))
+        yield Section("critic", "Critic over training", [figures_html(figure_groups["q"])], text)
+    yield Section("datasets", "Datasets", [table_html(tables_by_name["datasets"]), *_shipped(results)])
+    summary = f"Show {counted(len(tables_by_name['seeds'].rows), 'run')}"
+    every = tag("details", tag("summary", summary), table_html(tables_by_name["seeds"]))
     yield Section("runs", "Every run", [every, _waiting(results)])
 
 

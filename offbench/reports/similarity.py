@@ -68,13 +68,13 @@ def similarity_tables(results: Results) -> list[Table]:
 def _similar(entry: Entry) -> list[Similarity]:
     """Return the similar scores of the runs of a cell, as far as shown; damaged ones are named on stderr."""
     scores = []
-    for trained in entry.runs:
+    for run in entry.runs:
         try:
-            score = read_similarity(trained.run)
+            score = read_similarity(run.files)
         except OffbenchError as error:
             warn(f"left out of the similar scores: {error}")
             continue
-        if score is not None and score.step <= trained.steps:
+        if score is not None and score.step <= run.steps:
             scores.append(score)
     return scores
 
@@ -101,7 +101,7 @@ def _similar_cell(entry: Entry, values: Sequence[Similarity], number: str | None
     """
     tolerances, steps = (sorted({getattr(value, key) for value in values}) for key in ("tolerance", "step"))
     more = [f"tolerance {' and '.join(f'{t:g}' for t in tolerances)}"] if differ else []
-    if steps != sorted({trained.reached for trained in entry.runs}):
+    if steps != sorted({run.reached for run in entry.runs}):
         more.append(f"at {plural(len(steps), 'step')} {' and '.join(f'{step:,}' for step in steps)}")
     if len(values) < len(entry.runs):
         more.append(f"{len(values)} of {counted(len(entry.runs), 'run')}")

@@ -13,6 +13,7 @@ from offbench.analysis.evaluated_run import window_text
 from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import (
     REFERENCES,
+    SHORT_HASH,
     Entry,
     Results,
     Task,
@@ -23,7 +24,6 @@ from offbench.analysis.statistics import Estimate, Scores, improvement, iqm, pai
 from offbench.common.scores import SCORED_EVALUATIONS, mean_std, plus_minus
 from offbench.common.tables import Cell, Table
 from offbench.common.text import counted, from_to
-from offbench.training.run import DIGITS
 from offbench.training.run_config import RunConfig
 
 PAPER = "BDB paper, Table 1"
@@ -105,7 +105,7 @@ def row_name(results: Results, task: Task, *, scored: bool = False) -> list[Cell
     """
     env, level = task.env_and_level
     namesakes = {other.dataset for other in results.tasks if other.env_and_level == task.env_and_level}
-    apart = task.name if len(namesakes) > 1 else task.content[:DIGITS] if task.ambiguous else ""
+    apart = task.name if len(namesakes) > 1 else task.content_sha256[:SHORT_HASH] if task.ambiguous else ""
     several = scored and len({other.reference for other in results.tasks}) > 1
     more = [apart, REFERENCES[task.reference] if several else ""]
     below = task.dataset if apart != task.name else ""
@@ -199,9 +199,9 @@ def _environments_with_several_references(entries: Sequence[Entry]) -> list[str]
     """Return the environments whose datasets have more than one pair of references."""
     scales: dict[str, set[tuple[float, ...]]] = {}
     for entry in entries:
-        for trained in entry.runs:
+        for run in entry.runs:
             if entry.task.reference == "dataset":
-                scales.setdefault(entry.task.env_and_level[0], set()).add(trained.config.references["dataset"] or ())
+                scales.setdefault(entry.task.env_and_level[0], set()).add(run.config.references["dataset"] or ())
     return sorted(env for env, pairs in scales.items() if len(pairs) > 1)
 
 
@@ -219,7 +219,7 @@ def scale(results: Results) -> str:
     return " ".join([text for key, text in texts.items() if key in references]) + " Each row says which."
 
 
-def beside_table(results: Results) -> Table | None:
+def published_table(results: Results) -> Table | None:
     """Return our scores by both references beside every published number; None if nothing is published."""
     numbers: dict[tuple[str, str, str], dict[tuple[str, str], str]] = {}
     for row in published("scores"):
@@ -258,10 +258,10 @@ def iqms(results: Results) -> Aggregates:
     return {method: (iqm(by_task), by_task) for method, by_task in scores.items() if by_task}
 
 
-def iqm_table(results: Results, iqms: Aggregates) -> Table:
+def iqm_table(results: Results, aggregates: Aggregates) -> Table:
     """Return the IQM of every method with its interval."""
     rows = []
-    for method, (estimate, scores) in iqms.items():
+    for method, (estimate, scores) in aggregates.items():
         runs = sum(len(values) for values in scores.values())
         numbers = [Cell("-" if end is None else f"{end:.1f}", end) for end in (estimate.low, estimate.high)]
         counts = [Cell(f"{count}", count) for count in (len(scores), runs)]
@@ -274,7 +274,7 @@ def iqm_table(results: Results, iqms: Aggregates) -> Table:
         "highest quarter), and its 95% interval by stratified bootstrap: seeds are resampled within each "
         f"task (Agarwal et al. 2021). {FEW_SEEDS}",
     ]
-    if len({tuple(scores) for _, scores in iqms.values()}) > 1:
+    if len({tuple(scores) for _, scores in aggregates.values()}) > 1:
         notes.append("The methods were not run on the same tasks, so their IQMs cannot be compared.")
     if not all(results.comparable(task) for task in results.tasks):
         notes.append(
@@ -283,19 +283,19 @@ def iqm_table(results: Results, iqms: Aggregates) -> Table:
         )
     if len({task.reference for task in results.tasks if task.reference}) > 1:
         notes.append("The tasks' scores are normalized by different references (the table of scores says which).")
-    notes += mark_notes(entry for method in iqms for entry in results.of(method))
+    notes += mark_notes(entry for method in aggregates for entry in results.of(method))
     header = ["method", "IQM", "95% low", "95% high", "tasks", "runs"]
     return Table("iqm", "Interquartile mean over tasks", header, rows, notes)
 
 
-def improvement_table(results: Results, iqms: Aggregates) -> Table:
+def improvement_table(results: Results, aggregates: Aggregates) -> Table:
     """Return the probability that a run of the row's method beats one of the column's, over their common tasks."""
-    methods = list(iqms)
+    methods = list(aggregates)
     chances: dict[tuple[Method, Method], Estimate] = {}
     for i, a in enumerate(methods):
         for b in methods[i + 1 :]:
-            if set(iqms[a][1]) & set(iqms[b][1]):
-                chances[a, b] = estimate = improvement(iqms[a][1], iqms[b][1])
+            if set(aggregates[a][1]) & set(aggregates[b][1]):
+                chances[a, b] = estimate = improvement(aggregates[a][1], aggregates[b][1])
                 ends = (None if end is None else 1 - end for end in (estimate.high, estimate.low))
                 chances[b, a] = Estimate(1 - estimate.value, *ends)
     better = {pair for pair in chances if _better(results, *pair)}
@@ -332,24 +332,24 @@ def seed_table(results: Results) -> Table:
     """Return every run with its score and how far it is."""
     rows = []
     for entry in results.entries.values():
-        for trained in entry.runs:
-            score, ret = trained.score(entry.task.reference), trained.score(None)
+        for run in entry.runs:
+            score, ret = run.score(entry.task.reference), run.score(None)
             rows.append(
                 [
                     Cell(entry.task.name),
                     Cell(entry.method.label),
-                    Cell(str(trained.seed), trained.seed),
+                    Cell(str(run.seed), run.seed),
                     Cell(f"{score:.2f}", score) if entry.task.reference else EMPTY,
                     Cell(f"{ret:.2f}", ret),
                     Cell(REFERENCES[entry.task.reference]),
-                    Cell(str(len(trained.window)), len(trained.window)),
-                    Cell(f"{trained.reached:,}", trained.reached),
-                    Cell(f"{trained.steps:,}", trained.steps),
-                    Cell(trained.state),
+                    Cell(str(len(run.window)), len(run.window)),
+                    Cell(f"{run.reached:,}", run.reached),
+                    Cell(f"{run.steps:,}", run.steps),
+                    Cell(run.state),
                 ]
             )
-    for run in results.unevaluated:
-        config = run.config()
+    for waiting in results.unevaluated:
+        config = waiting.config()
         texts = [_waiting_name(results, config), f"{config.algorithm} {config.variant}".removesuffix(" default")]
         numbers = [
             Cell(str(config.seed)),
@@ -360,13 +360,13 @@ def seed_table(results: Results) -> Table:
             Cell("0", 0),
             Cell(f"{config.steps:,}"),
         ]
-        rows.append([*map(Cell, texts), *numbers, Cell("diverged" if run.diverged else "not evaluated yet")])
+        rows.append([*map(Cell, texts), *numbers, Cell("diverged" if waiting.diverged else "not evaluated yet")])
     header = ["dataset", "method", "seed", "score", "return", "reference", "evaluations", "step", "of", "state"]
     return Table("seeds", "Every run", header, rows, [], 3)
 
 
 def _waiting_name(results: Results, config: RunConfig) -> str:
     """Return a dataset's id, with its content's first digits where the id alone is ambiguous."""
-    contents = {task.content for task in results.tasks if task.dataset == config.dataset}
+    contents = {task.content_sha256 for task in results.tasks if task.dataset == config.dataset}
     ambiguous = bool(contents) and contents != {config.dataset_sha256}
     return Task(config.dataset, config.dataset_sha256, None, ambiguous).name

@@ -89,9 +89,9 @@ def _runs(root: str | Path) -> list[JsonObject]:
         raise OffbenchError(f"{root} is not a folder of runs")
     entries, unevaluated = entries_of(find_runs(Path(root)), compared=False)
     rows = [
-        _run(entry.task.name, entry.method.label, trained.run, trained.config, trained)
+        _run(entry.task.name, entry.method.label, run.files, run.config, run)
         for entry in entries
-        for trained in entry.runs
+        for run in entry.runs
     ]
     for run in unevaluated:
         config = run.config()
@@ -100,20 +100,20 @@ def _runs(root: str | Path) -> list[JsonObject]:
     return rows
 
 
-def _run(dataset: str, method: str, run: Run, config: RunConfig, trained: EvaluatedRun | None) -> JsonObject:
-    """Return a run's row; `trained` is None if it was not evaluated yet."""
+def _run(dataset: str, method: str, run: Run, config: RunConfig, evaluated: EvaluatedRun | None) -> JsonObject:
+    """Return a run's row; `evaluated` is None if it was not evaluated yet."""
 
     def score(reference: str) -> float | None:
-        return trained.score(reference) if trained and config.references.get(reference) else None
+        return evaluated.score(reference) if evaluated and config.references.get(reference) else None
 
     return {
         "dataset": dataset,
         "method": method,
         "seed": config.seed,
-        "step": trained.reached if trained else run.newest_checkpoint(),
+        "step": evaluated.reached if evaluated else run.newest_checkpoint(),
         "steps": config.steps,
-        "state": trained.state if trained else "diverged" if run.diverged else "unfinished",
-        "return": trained.score(None) if trained else None,
+        "state": evaluated.state if evaluated else "diverged" if run.diverged else "unfinished",
+        "return": evaluated.score(None) if evaluated else None,
         "score": score("dataset"),
         "d4rl_score": score("d4rl"),
         "folder": str(run.folder),

@@ -104,7 +104,7 @@ def new_run_config(spec: RunSpec, data: Transitions, device: str, command: str) 
         label=spec.label,
         settings=settings_json(spec.config),
         dataset=data.dataset_id,
-        dataset_sha256=data.content,
+        dataset_sha256=data.content_sha256,
         seed=spec.seed,
         steps=spec.steps,
         eval_every=spec.eval_every,

@@ -41,7 +41,7 @@ def restore(run: Run, algorithm: str | type | None = None) -> Stack:
         )
     settings = build(algorithm_class.Config, recorded, f"{run.config_path}: settings")
     data = transitions.load(config.dataset)
-    if data.content != config.dataset_sha256:
+    if data.content_sha256 != config.dataset_sha256:
         raise OffbenchError(f"{data.dataset_id} is no longer the dataset that {run.folder} was trained on")
     newest = checkpoints.load_newest(run.folder)
     if newest is None:

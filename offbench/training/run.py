@@ -42,7 +42,6 @@ from offbench.training.run_config import FORMAT, RunConfig, Session
 EVALUATION_COLUMNS = ("step", "episode", "return", "length")
 DELETE_TO_REPEAT = "delete the run to repeat it"
 TRAIN_ANEW = "delete that run (`train` does with --fresh) or give another --runs"
-DIGITS = 8  # of a content hash, where a table must tell two contents of one dataset id apart
 MUST_MATCH = ("algorithm", "settings", "dataset", "dataset_sha256", "seed", "eval_every", "eval_episodes")
 
 

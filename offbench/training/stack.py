@@ -100,7 +100,7 @@ class Stack:
             "algorithm": spec.algorithm,
             "seed": spec.seed,
             "dataset": data.dataset_id,
-            "dataset_sha256": data.content,
+            "dataset_sha256": data.content_sha256,
         }
 
     def checkpoint_origin(self, run: int) -> JsonObject:

@@ -31,7 +31,7 @@ def test_three_seeds_by_hand(home: Path) -> None:
     assert (found.statistics.difference.low, found.statistics.difference.high) == (1.0, 3.0)
     assert found.chance.value == 1.0  # all nine pairs of runs
     # the interval leaves out 0, as three equal signs always make it; one time in four that is chance
-    assert found.verdict == "no evidence of a difference at 3 seeds"
+    assert found.verdict == "no evidence of a difference with 3 seeds"
 
 
 def test_enough_seeds_give_a_verdict(home: Path) -> None:
@@ -39,8 +39,8 @@ def test_enough_seeds_give_a_verdict(home: Path) -> None:
         scores(home / "runs", "td3_bc", [55.0, 55.0, 55.0], dataset)
         scores(home / "runs", "cql", [50.0, 50.0, 50.0], dataset)
     # six differences of 5: p = 2 / 64
-    assert offbench.compare("td3_bc", "cql").verdict == "td3_bc is better: +5.0 [5.0, 5.0] at 3 seeds on 2 datasets"
-    assert offbench.compare("cql", "td3_bc").verdict == "td3_bc is better: +5.0 [5.0, 5.0] at 3 seeds on 2 datasets"
+    assert offbench.compare("td3_bc", "cql").verdict == "td3_bc is better: +5.0 [5.0, 5.0] with 3 seeds on 2 datasets"
+    assert offbench.compare("cql", "td3_bc").verdict == "td3_bc is better: +5.0 [5.0, 5.0] with 3 seeds on 2 datasets"
     found = offbench.compare("cql", "td3_bc")
     assert (found.statistics.difference.value, found.statistics.p, found.chance.value) == (-5.0, 2 / 64, 0.0)
 
@@ -59,7 +59,7 @@ def test_only_what_both_have_is_paired(home: Path, capsys: pytest.CaptureFixture
     text = capsys.readouterr().out
     assert "note: 2 runs have no partner of the same dataset and seed and are left out" in text
     assert "mean difference             -2.5 [-4.0, -1.0]" in text
-    assert text.splitlines()[-1] == "no evidence of a difference at 2 seeds"
+    assert text.splitlines()[-1] == "no evidence of a difference with 2 seeds"
 
 
 def test_the_scores_stand_below_whose_they_are(home: Path) -> None:
@@ -79,7 +79,7 @@ def test_one_seed_is_no_evidence(home: Path) -> None:
     scores(home / "runs", "td3_bc", [90.0])
     scores(home / "runs", "cql", [10.0])
     found = offbench.compare("td3_bc", "cql")
-    assert found.verdict == "no evidence of a difference at 1 seed"
+    assert found.verdict == "no evidence of a difference with 1 seed"
     assert "mean difference             +80.0\n" in "\n".join(found.lines())
 
 

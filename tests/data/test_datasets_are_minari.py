@@ -101,7 +101,7 @@ def test_the_content_hash_is_over_the_arrays(medium: str) -> None:
     for episode in minari.load_dataset(medium).iterate_episodes():
         content.add(episode.observations, episode.actions, episode.rewards, episode.terminations, episode.truncations)
     assert content.hexdigest() == minari_store.provenance(minari_store.read_metadata(medium)).content_sha256
-    assert content.hexdigest() == offbench.load(medium).content
+    assert content.hexdigest() == offbench.load(medium).content_sha256
 
 
 def test_medium_expert_is_medium_then_expert(tiny: tuple[str, str]) -> None:

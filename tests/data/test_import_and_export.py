@@ -244,7 +244,7 @@ def test_blocks_join_right(medium: str, home: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("offbench.data.export.CHUNK", 37)
     monkeypatch.setattr("offbench.data.import_d4rl.BLOCK", 41)
     import_d4rl(export(medium, home / "out.hdf5"), "back-v0")
-    assert transitions.load("back-v0").content == transitions.load(medium).content
+    assert transitions.load("back-v0").content_sha256 == transitions.load(medium).content_sha256
 
 
 def test_a_failed_export_leaves_the_old_file(medium: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,7 +107,7 @@ def test_minaris_remote_keeps_metadata_card_and_references(
     """Ids need a namespace: Minari 0.5.4 lists no others on the Hub."""
     name = "mine/pendulum-medium-v0"
     offbench.collect("inverted-pendulum", "medium", steps=600, workers=1, dataset_id=name)
-    before, content = minari_store.read_metadata(name), offbench.load(name).content
+    before, content = minari_store.read_metadata(name), offbench.load(name).content_sha256
     main(["card", name, "--huggingface"])
     card = (minari_store.path_of(name) / "README.md").read_text()
     assert f"\nMINARI_REMOTE=hf://USER minari download {name}\n" in card
@@ -124,7 +124,7 @@ def test_minaris_remote_keeps_metadata_card_and_references(
     assert (minari_store.path_of(name) / "README.md").read_text() == card
     assert minari_store.read_metadata(name) == before
     data = offbench.load(name)
-    assert data.content == content
+    assert data.content_sha256 == content
     assert data.references == (before["ref_min_score"], before["ref_max_score"])
     assert offbench.verify(name, workers=1).ok
     # and with Minari alone, into a third folder
@@ -134,7 +134,7 @@ def test_minaris_remote_keeps_metadata_card_and_references(
 
 
 def test_an_archive_for_a_colleague(medium: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, content = minari_store.root(), offbench.load(medium).content
+    source, content = minari_store.root(), offbench.load(medium).content_sha256
     env = offbench.make_env(medium)
     subprocess.run(["tar", "-cf", f"{home}/data.tar", "-C", str(source), medium], check=True)
     elsewhere(home, monkeypatch)
@@ -145,7 +145,7 @@ def test_an_archive_for_a_colleague(medium: str, home: Path, monkeypatch: pytest
     subprocess.run(["tar", "-xf", f"{home}/data.tar", "-C", str(minari_store.root())], check=True)
     assert minari_store.local_ids() == [medium]
     assert offbench.verify(medium, workers=1).ok
-    assert offbench.load(medium).content == content
+    assert offbench.load(medium).content_sha256 == content
     assert offbench.make_env(medium).spec == env.spec
 
 
@@ -165,7 +165,7 @@ def test_the_hubs_card_says_what_the_data_are(medium: str, home: Path, capsys: p
     spread = f"std {returns.std():.1f}, {returns.min():.1f} to {returns.max():.1f}"
     assert f"| return of an episode | mean {returns.mean():.1f}, {spread} |" in text
     assert "| transitions | 600 |" in text
-    assert f"| content sha256 | {offbench.load(medium).content} |" in text
+    assert f"| content sha256 | {offbench.load(medium).content_sha256} |" in text
     assert "| environment | InvertedPendulum-v5 |" in text
     assert offbench.verify(medium, workers=1).ok  # a card in the folder is no fault
     main(["card", medium, "--huggingface", "--out", "card.md"])

@@ -108,5 +108,5 @@ def test_what_python_shows_of_an_object_is_short(medium: str) -> None:
     lines = offbench.show(medium).lines()
     place = lines.index("provenance")
     assert any(line.startswith("  fraction ") for line in lines[place:])
-    assert f"content_sha256  {data.content}" in lines
+    assert f"content_sha256  {data.content_sha256}" in lines
     assert not any("{" in line for line in lines)

@@ -100,7 +100,7 @@ def test_data_that_are_recorded_anew_before_the_training_begins(
     with pytest.raises(OffbenchError, match=r"trained on another content of tiny-medium-v0.*run the command again"):
         offbench.train("td3_bc", medium, steps=50, **SMALL)
     (folder,) = offbench.train("td3_bc", medium, steps=50, **SMALL)
-    assert Run(folder).config().dataset_sha256 == offbench.load(medium).content
+    assert Run(folder).config().dataset_sha256 == offbench.load(medium).content_sha256
 
 
 def test_a_run_that_is_claimed_anew_before_the_training_begins(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
