@@ -28,7 +28,7 @@ def behaviour(
 
     Args:
         env: a shipped recipe's name, a recipe file, or a Recipe.
-        seed: of the training. The same recipe and seed give the same weights.
+        seed: seed of the training. The same recipe and seed give the same weights.
         steps: environment steps; default: the recipe's. Steps beyond the recipe's use its final learning
             rate. If more are trained already, the ladder is built from the first `steps`.
         workers: processes that measure the rungs (training itself is one process of one thread).

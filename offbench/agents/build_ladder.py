@@ -46,7 +46,7 @@ from offbench.rollouts.rollouts import MEASURES, EpisodeStats, Rollouts, summary
 EXPERT_CANDIDATES = 8  # late rungs measured to choose the expert
 MOST_MEASURED = 6  # policies measured to find the one nearest a return
 CROSSINGS = 3  # pairs of neighboring rungs between which policies within a segment are screened
-MEASURED = "measured.json"  # in a training's folder: a build that was interrupted resumes from it
+MEASURED = "measured.json"  # the file in a training's folder from which an interrupted build resumes
 COLUMNS = ("step", "hours", "role", "policy", *MEASURES, *(f"deterministic_{m}" for m in MEASURES), "episodes")
 
 
@@ -54,9 +54,9 @@ class RungEvaluator:
     """Measures policies of a training, each at most once, and chooses among them.
 
     Args:
-        folder: of the training.
-        rows: of rungs.csv, for the rungs at the ends of segments.
-        policy_steps: of all policies that were kept, those within segments included.
+        folder: the training's folder.
+        rows: the rows of rungs.csv, for the rungs at the ends of segments.
+        policy_steps: the steps of all saved policies, including those within segments.
         rollouts: where episodes are played.
     """
 

@@ -31,7 +31,7 @@ from offbench.envs.version_warning import warn_other_physics
 from offbench.rollouts.policy import Policy, load_policy
 
 BEHAVIOUR = Path("behaviour")  # default folder of all trainings
-MEDIUM = 1 / 3  # of the expert's normalized return
+MEDIUM = 1 / 3  # fraction of the expert's normalized return
 MEDIUM_AT_MOST = 0.45  # a rung beyond this is chosen as medium only if there is no other
 MEDIUM_LIMITS = (0.2, 0.6)  # a medium outside these needs --accept
 NEAR = 0.05  # largest distance of a rung from a requested fraction; others need --accept
@@ -69,7 +69,7 @@ class LadderInfo:
         references: `return`, its interval `low` to `high`, and `episodes` of the policies `random` and `expert`.
         levels: the steps of the rungs `medium` and `expert`.
         env_code: hashes of the environment's code and files when the training began.
-        seed, steps, hours, sac, hardware, versions, command: of the training.
+        seed, steps, hours, sac, hardware, versions, command: how the agent was trained.
     """
 
     env_id: str

@@ -66,7 +66,7 @@ def restore(folder: TrainingFolder, model: SAC, start_segment: Callable[[int], N
     """Load the newest usable checkpoint into `model`.
 
     Args:
-        folder: of the training.
+        folder: the training's folder.
         model: newly made; left as it is if there is no checkpoint.
         start_segment: seeds the generators and resets the environments as at the start of the segment of that step.
 

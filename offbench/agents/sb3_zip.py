@@ -80,7 +80,7 @@ def _read(path: Path) -> tuple[dict[str, Array], JsonObject]:
             if archive.getinfo(name).file_size > LARGEST:
                 raise ValueError(f"{name} is larger than {LARGEST:,} bytes")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of old formats: what they hold is checked below
+            warnings.simplefilter("ignore")  # about old formats: their content is checked below
             try:
                 weights = torch.load(io.BytesIO(archive.read("policy.pth")), map_location="cpu", weights_only=True)
             except (pickle.UnpicklingError, RecursionError):

@@ -57,8 +57,10 @@ class Trace:
         self.key: list[tuple[object, Nested]] = []
         self.outside: list[Tensor] = []
         self._kept: list[Nested] = []  # no storage of the record is freed and used again
-        self._origins: dict[int, tuple[str, int]] = {}  # of a storage's address: the call that made it, or `outside`
-        self._constants: dict[int, int] = {}  # of a storage's address: the call that fills it
+        self._origins: dict[
+            int, tuple[str, int]
+        ] = {}  # by a storage's address: the call that allocated it, or `outside`
+        self._constants: dict[int, int] = {}  # by a storage's address: the call that fills it
 
     def replay(self) -> None:
         """Do the update once more. Call it within `torch.inference_mode()`."""
@@ -82,7 +84,9 @@ class Trace:
         Args:
             constant: it writes the same numbers every time.
         """
-        described = tree_map_only(float, repr, tree_map_only(Tensor, self._describe, reads))  # NaN equals itself so
+        described = tree_map_only(
+            float, repr, tree_map_only(Tensor, self._describe, reads)
+        )  # repr, so that NaN compares equal
         origin = ("call", len(self.calls))
         for tensor in _tensors(writes):
             self._origins.setdefault(_address(tensor), origin)
@@ -222,7 +226,7 @@ def _state(value: object, above: frozenset[int], kept: set[int] | None) -> objec
         ignored = kept is None or value.is_inference() or _memory(value) in kept
         return id(value), 0 if ignored else value._version
     if value is None or isinstance(value, bool | int | float | complex | str | bytes):
-        return type(value).__name__, repr(value)  # NaN equals itself so
+        return type(value).__name__, repr(value)  # repr, so that NaN compares equal
     if id(value) in above or isinstance(value, type) or callable(getattr(value, "tensors", None)):
         return id(value)
     inner = above | {id(value)}

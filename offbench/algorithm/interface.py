@@ -281,8 +281,8 @@ def per_sample(value: Any, **words: Tensor) -> Tensor:
     """Return a `per_run` setting as [runs, 1], to combine with [runs, batch].
 
     Args:
-        words: of a setting that may also be a word: what stands for the word, [runs, batch]. The result then has
-            that shape.
+        words: for a setting that can also be a word: the values in runs with that word, [runs, batch]. The result
+            then has this shape.
     """
     if not isinstance(value, _NumbersOrWords):
         result: Tensor = value.unsqueeze(-1)

@@ -26,7 +26,7 @@ from offbench.common import seeds
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import Purpose
 
-Schedule = Callable[[Tensor], Tensor]  # from the number of earlier steps, a tensor [], to the learning rate
+Schedule = Callable[[Tensor], Tensor]  # takes the number of earlier steps, a tensor []; returns the learning rate
 
 
 class NetworkOptions(TypedDict, total=False):
@@ -54,8 +54,8 @@ class Parameters:
 
     Args:
         learning_rate: Adam's; a number, or a function of the number of earlier steps (`cosine_decay`).
-        weight_decay: decoupled from the gradient, as in AdamW; of all parameters.
-        scalar: whether `value` lacks its last axis.
+        weight_decay: decoupled weight decay of all parameters, as in AdamW.
+        scalar: whether `value` is without its last axis.
     """
 
     def __init__(

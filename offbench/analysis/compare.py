@@ -46,7 +46,7 @@ class Comparison:
         statistics: statistics of the difference A - B.
         chance: probability that a run of A scores above one of B, over the paired runs.
         unpaired: how many runs of either have no partner and are left out.
-        windows: which evaluations are behind the scores of A's and of B's paired runs, in words.
+        windows: the evaluations behind the scores of A's and of B's paired runs, in words.
         comparable: whether both runs of each pair are scored over evaluations at the same steps.
         unfinished: how many of the paired runs have not reached their last step, or have diverged.
         changed: the algorithms whose paired runs were trained by different code.

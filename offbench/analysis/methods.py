@@ -15,9 +15,9 @@ from offbench.training.registry import algorithm_names
 from offbench.training.run_config import RunConfig
 from offbench.training.spec import folder_name
 
-METHOD_ORDER = ("td3_bc", "cql", "bdb")  # of the BDB paper's Table 1
+METHOD_ORDER = ("td3_bc", "cql", "bdb")  # column order of the BDB paper's Table 1
 BY_DATASET = "different for each dataset"  # variant of a method whose settings differ between datasets
-EXTENSION_SETTINGS = FORMER_SETTINGS["bdb"].keys()  # of bdb that are not the paper's
+EXTENSION_SETTINGS = FORMER_SETTINGS["bdb"].keys()  # settings of bdb that are not in the paper
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def find_method(methods: Sequence[Method], name: str) -> Method:
 def _beta(value: object) -> str | None:
     if isinstance(value, int | float) and abs(value) < 1e6:
         return text if float(text := f"{value:.2f}") == value else f"{value:g}"
-    # of a damaged config.json or a third party's algorithm
+    # settings of a damaged config.json or a third party's algorithm
     return None if value is None else f"{' '.join(str(value).split()):.60}"
 
 

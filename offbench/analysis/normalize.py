@@ -166,7 +166,7 @@ TITLES: dict[str, str | None] = {
     "of_steps": None,  # shown as 50,000 of 1,000,000 in the steps column
     "score": "score (own ref.)",
     "score_std": None,
-    "iqm": None,  # in JSON and CSV only: over the few seeds of one dataset it is close to the mean
+    "iqm": None,  # only in JSON and CSV: over the few seeds of one dataset it is close to the mean
     "iqm_low": None,
     "iqm_high": None,
     "d4rl_score": "score (D4RL ref.)",
@@ -241,7 +241,7 @@ def _best(rows: Sequence[Row]) -> set[int]:
 
 
 def notes(rows: Sequence[Row]) -> list[str]:
-    """Return what a reader must know of a score table: which scores do not compare, settings that names leave out."""
+    """Return the notes on a score table: scores that are not comparable, and settings that names leave out."""
     windows: dict[tuple[str, str | None], set[str | None]] = {}
     for row in rows:
         if "window" in row:

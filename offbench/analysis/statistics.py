@@ -95,9 +95,9 @@ class Paired:
     """The difference of A and B over pairs of runs (same task, same seed).
 
     Attributes:
-        difference: of normalized scores, mean over seeds, then over tasks.
+        difference: difference of normalized scores, mean over seeds, then over tasks.
         standardized: mean over standard deviation of all pairs' differences; None where they do not vary.
-        p: of a sign-flip test, two-sided: how often a difference as large comes about if A and B are alike.
+        p: two-sided p-value of a sign-flip test.
         pairs: how many pairs there are.
     """
 

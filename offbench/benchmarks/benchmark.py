@@ -86,7 +86,7 @@ def benchmark(
         return False  # out of time
     specs = [spec for share in shard_of(bench, shard) for spec in share if not is_longer(spec)]
     training = Training(specs, bench.machine, command=command)
-    for line in training.diverged:  # in an earlier call, which raised for it
+    for line in training.diverged:  # an earlier call raised for these
         say(line)
     raise_first(training.run(executor.train, deadline=deadline, cost=update_seconds))
     return not training.unfinished_jobs()

@@ -25,7 +25,7 @@ from offbench.training.stack import Stack
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-SECONDS = 0.5  # that a measurement lasts at least
+SECONDS = 0.5  # minimum duration of a measurement
 ROWS = 4096  # random transitions
 ENV_STEPS = 2000
 COUNTED = 4  # updates whose operations are counted: enough to include every phase of an alternating update
@@ -36,8 +36,8 @@ class Rate:
     """What one algorithm costs on one device.
 
     Attributes:
-        updates: updates a second of all runs of a stack together.
-        bytes_per_run: of a checkpoint.
+        updates: updates per second, summed over the runs of a stack.
+        bytes_per_run: size of a checkpoint.
     """
 
     updates: float

@@ -75,7 +75,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
         rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
         rest["algorithm"], settings = algorithm, named_settings | settings
-        if "precision" in named_settings:  # which is in the names of methods, but no setting
+        if "precision" in named_settings:  # part of a method's name, but not a setting
             (rest["precision"],) = settings.pop("precision")
         if reserved := RESERVED_SETTINGS & settings.keys():
             raise unknown(f"setting of {algorithm}", min(reserved), fields(config))

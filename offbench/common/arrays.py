@@ -15,7 +15,7 @@ Array = npt.NDArray[Any]
 
 def content_sha256(arrays: Mapping[str, Array], state: Mapping[str, object]) -> str:
     """Return the SHA-256 of named arrays and of a JSON state, which detects any changed bit."""
-    plain = json.loads(json.dumps(state))  # as it will be read back: tuples as lists, keys as text
+    plain = json.loads(json.dumps(state))  # the form in which it is read back: lists for tuples, text for keys
     content = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
     for name in sorted(arrays):
         content.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}".encode())

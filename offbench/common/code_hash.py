@@ -27,7 +27,7 @@ def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     if not set(before) & set(now):
         return f"{', '.join(before)}, not {', '.join(now)}"
     differ = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-    if not any(name.startswith(MAIN) for name in before):  # of an earlier version, which did not record them
+    if not any(name.startswith(MAIN) for name in before):  # earlier versions did not record them
         differ = [name for name in differ if not name.startswith(MAIN)]
     return ", ".join(f"{name} {_describe_change(before.get(name), now.get(name))}" for name in differ)
 
@@ -101,7 +101,7 @@ def imported_files(file: Path, root: Path, seen: dict[Path, None]) -> dict[Path,
 
 
 def _text(file: Path) -> str:
-    with tokenize.open(file) as opened:  # in the encoding that the file declares
+    with tokenize.open(file) as opened:  # uses the encoding that the file declares
         return opened.read()
 
 

@@ -117,7 +117,7 @@ def exclusive_lock(path: Path, what: str, timeout: float = LOCK_TIMEOUT) -> Iter
         lock.release()
 
 
-_inodes: dict[Path, int] = {}  # of the lock files that this process holds; a relative path may lead elsewhere later
+_inodes: dict[Path, int] = {}  # inodes of this process's lock files; a relative path may lead elsewhere later
 
 
 def _holds(lock: Path) -> bool:

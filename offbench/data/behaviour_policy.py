@@ -17,7 +17,7 @@ from offbench.data.levels import FRACTION, LEVELS
 from offbench.rollouts.function_policy import FunctionPolicy, function_policy
 from offbench.rollouts.policy import Policy, load_policy
 
-POLICY = "policy.safetensors"  # of a run's folder
+POLICY_FILE = "policy.safetensors"  # file name in a run's folder
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class BehaviourPolicy:
     Attributes:
         policy: acts in the environment's bounds.
         source: as the user named it, without folders.
-        algorithm: what trained it, for the metadata.
+        algorithm: the algorithm that trained it, for the metadata.
         sha256: of the policy, or of the module of a function.
     """
 
@@ -54,7 +54,7 @@ def read_behaviour_policy(source: str, low: Array, high: Array, observation_dim:
     if path.suffix.lower() == ".zip":
         policy = read_sb3_zip(path, low, high, env_id)
     else:
-        policy = load_policy(path / POLICY if path.is_dir() else path)
+        policy = load_policy(path / POLICY_FILE if path.is_dir() else path)
     shapes = (len(policy.observation_mean), len(policy.low))
     if shapes != (observation_dim, len(low)):
         raise OffbenchError(

@@ -121,4 +121,4 @@ def _export_metadata(path: Path, file: h5py.File) -> JsonObject:
 _STRINGS = ("env_spec", "eval_env_spec", "observation_space", "action_space", "algorithm_name", "description")
 _LISTS = ("author", "author_email", "requirements")
 NUMBERS = ("ref_min_score", "ref_max_score", "num_episodes_average_score")
-KEPT = (*_STRINGS, *_LISTS, *NUMBERS, minari_store.KEY)  # of Minari's metadata, in a file that offbench exported
+KEPT = (*_STRINGS, *_LISTS, *NUMBERS, minari_store.KEY)  # Minari's metadata in a file that offbench exported

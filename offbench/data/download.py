@@ -30,7 +30,7 @@ def download(dataset_id: str) -> None:
         if minari_store.exists(dataset_id):  # another process was faster
             return
         temporary = root / ".offbench-download"
-        shutil.rmtree(temporary, ignore_errors=True)  # of a download that was killed
+        shutil.rmtree(temporary, ignore_errors=True)  # left by a download that was killed
         try:
             with environment({"MINARI_DATASETS_PATH": str(temporary)}):
                 _fetch(dataset_id)
@@ -50,7 +50,7 @@ def _fetch(dataset_id: str) -> None:
             minari.download_dataset(dataset_id)
     except ImportError as error:
         raise OffbenchError(f"cannot download {dataset_id}: {error}") from None
-    except Exception as error:  # of Minari, its clients and the network
+    except Exception as error:  # Minari, its clients and the network raise many types
         reason = " ".join(printable(str(error) or type(error).__name__).split())
         remedy = "check the id (`minari list remote`) and the connection"
         raise OffbenchError(f"cannot download {dataset_id}: {reason}; {remedy}") from error

@@ -35,7 +35,7 @@ from offbench.envs.environments import box
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-FORMATS = {"d4rl": (".hdf5", ".h5"), "npz": (".npz",)}  # and how their files end
+FORMATS = {"d4rl": (".hdf5", ".h5"), "npz": (".npz",)}  # {format: endings of its files}
 CHUNK = 16_384  # rows of a compressed piece
 PIECE = 1 << 20  # bytes copied at once
 ATTRIBUTE = 60_000  # bytes that HDF5 lets an attribute have

@@ -37,7 +37,7 @@ def huggingface_card(dataset_id: str, out: str | Path | None = None) -> Path:
 
 
 def _header(summary: Summary) -> Iterator[str]:
-    """Return the YAML that the Hub reads. It states no license: that is the uploader's to choose."""
+    """Return the YAML that the Hub reads. It states no license: the uploader chooses one."""
     steps = int(summary.lengths.sum())
     yield "---"
     yield f"pretty_name: {json.dumps(summary.dataset_id)}"

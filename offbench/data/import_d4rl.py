@@ -50,7 +50,7 @@ from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference, load_recip
 from offbench.rollouts.rollouts import Episode
 
 BLOCK = 65_536  # rows read at once
-RESETS = 64  # of the environment, to learn where episodes begin
+RESETS = 64  # number of resets of the environment, to learn where episodes begin
 WITHIN, BEYOND = 2.0, 6.0  # multiples of the spread of first observations: what is one, and what is none
 # observations and actions of the environments that D4RL's own files were recorded in
 ORIGINAL = {"Hopper-v2": (11, 3), "HalfCheetah-v2": (17, 6), "Walker2d-v2": (17, 6), "Ant-v2": (111, 8)}
@@ -106,7 +106,7 @@ class _Origin:
 
     Attributes:
         recorded: the EnvSpec (JSON) of the environment it was recorded in, None if unknown.
-        evaluated: that of the environment to evaluate policies in.
+        evaluated: EnvSpec of the environment to evaluate policies in.
         recipe: whose action bounds hold where the file has none.
     """
 

@@ -17,7 +17,7 @@ class Part:
     Attributes:
         source: `uniform` actions, the `medium` or `expert` rung, the `replay` of training, or a fraction
             such as "0.6" for the rung nearest to it.
-        weight: its transitions, as a multiple of the recipe's `dataset_steps`.
+        weight: number of transitions, as a multiple of the recipe's `dataset_steps`.
     """
 
     source: str
@@ -26,7 +26,7 @@ class Part:
 
 FRACTION = r"\d+(?:p\d+)?percent"  # the name of a fraction in a dataset id: 60percent, 12p5percent
 
-LEVELS: dict[str, tuple[Part, ...]] = {  # in order of their mean return
+LEVELS: dict[str, tuple[Part, ...]] = {  # sorted by mean return
     "random": (Part("uniform"),),
     "medium-replay": (Part("replay"),),
     "medium": (Part("medium"),),
@@ -105,8 +105,9 @@ def full_size(parts: tuple[Part, ...], dataset_steps: int, replay_steps: int | N
     """Return the transitions of a level.
 
     Args:
-        dataset_steps: the recipe's, of one part.
-        replay_steps: those of the ladder's medium-replay, which is recorded whole; None without a ladder.
+        dataset_steps: the recipe's number of transitions of a part.
+        replay_steps: the number of transitions of the ladder's medium-replay, which is recorded whole; None without a
+            ladder.
     """
     if replay_steps is not None and [part.source for part in parts] == ["replay"]:
         return replay_steps

@@ -46,8 +46,8 @@ class Provenance:
         d4rl: D4RL's reference scores.
         env_code: hashes of the environment's code and files, if it is not Gymnasium's.
         imported: the D4RL file that the dataset was imported from.
-        timeouts: of an import: whether the steps at a timeout are `kept` or `dropped`.
-        final_observations: of an import: whether the last observations of terminated episodes are `kept`, or the
+        timeouts: for an import, whether the steps at a timeout are `kept` or `dropped`.
+        final_observations: for an import, whether the last observations of terminated episodes are `kept`, or the
             ones before `repeated`.
     """
 
@@ -246,7 +246,7 @@ def hidden_path(path: Path, ending: str) -> Path:
     return path.with_name(f".offbench-{path.name}.{ending}")
 
 
-REPLACED = re.compile(r"\.offbench-([^.].*)\.old")  # of `hidden_path`
+REPLACED = re.compile(r"\.offbench-([^.].*)\.old")  # matches the "old" paths of `hidden_path`
 
 
 def _restore_replaced(path: Path) -> bool:

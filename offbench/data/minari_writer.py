@@ -43,8 +43,9 @@ def write(
         path: the folder of a claimed id; an existing dataset is replaced at the end.
         env_spec: the environment's EnvSpec as JSON, None if unknown.
         metadata: Minari's fields; the content hash joins those under the key `offbench`.
-        steps: the expected transitions, to check that the disk has room.
-        spaces: of observations and actions; Minari would otherwise make the environment, which may no longer exist.
+        steps: the expected number of transitions, to check the free disk space.
+        spaces: the spaces of observations and actions; without them, Minari would make the environment, which may no
+            longer exist.
         expected: the content hash that the data must have (None: any).
     """
     spec = parse_spec(env_spec) if env_spec else None

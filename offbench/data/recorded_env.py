@@ -16,7 +16,9 @@ from offbench.envs.environments import Env, untrusted_env
 from offbench.envs.margin_rule import MAX_RULE, MUJOCO_VERSIONS, SUM_RULE, with_margin
 from offbench.envs.recipes import load_recipe, names
 
-CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d{1,6})(?:\.(\d{1,6}))?")  # of a requirement: `>=3.1.0,<3.2.0` has two
+CLAUSE = re.compile(
+    r"(==|~=|<=|>=|<|>)\s*(\d{1,6})(?:\.(\d{1,6}))?"
+)  # a clause of a requirement: `>=3.1.0,<3.2.0` has two
 
 
 def make_env(name: str | Path, render_mode: str | None = None) -> Env:

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from minari import EpisodeData, MinariDataset
 
 ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
-ATTEMPTS = 3  # to read a dataset that is replaced meanwhile
+ATTEMPTS = 3  # attempts to read a dataset that is being replaced
 NUMBERS = ("observations", "actions", "rewards")
 LEAST_USED_RANGE = 1e-3  # share of the range between the action bounds that actions should use
 CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding cause a warning
@@ -277,7 +277,9 @@ def _delete_earlier_conversions(source: str) -> None:
     for meta in cache().glob("*/meta.json"):
         with contextlib.suppress(OffbenchError):  # another dataset's, which is damaged
             if read_json(meta).get("source") == source:
-                temporary = meta.parent.with_name(f".{meta.parent.name}.old")  # which `_remove_leftovers` knows
+                temporary = meta.parent.with_name(
+                    f".{meta.parent.name}.old"
+                )  # removed by `_remove_leftovers` after a kill
                 with contextlib.suppress(OSError):
                     meta.parent.replace(temporary)
                     shutil.rmtree(temporary)

@@ -31,7 +31,7 @@ from offbench.common.terminal import warn
 from offbench.envs.margin_rule import MAX_RULE, MUJOCO_VERSIONS, SUM_RULE
 
 SUMMED_SINCE, GAP_OUTSIDE_SINCE, RK4_ROTATIONS_SINCE = (3, 5), (3, 9), (4, 0)
-ROUNDING = 1e-12  # of a sum of two margins, in the model's unit of length
+ROUNDING = 1e-12  # rounding error of a sum of two margins, in the model's unit of length
 
 
 def release(version: str) -> tuple[int, int]:

@@ -33,7 +33,7 @@ def environment_code(env_spec: str) -> dict[str, str]:
     return dict(sorted(hashes.items()))
 
 
-@functools.cache  # as it was imported: its files may change later
+@functools.cache  # cached at import: its files may change later
 def _code(factory: type | Callable[..., object]) -> dict[str, str]:
     classes = factory.__mro__ if isinstance(factory, type) else (factory,)
     hashes: dict[str, str] = {}

@@ -174,11 +174,11 @@ _warned_no_time_limit: set[str] = set()  # environments that a warning was print
 def make_env(env_spec: str, render_mode: str | None = None) -> Env:
     """Make the environment of an EnvSpec (JSON) with its contact margins, without Gymnasium's environment checker."""
     plain, rule = without_margin(env_spec)
-    made = EnvSpec.from_json(plain)
-    made.disable_env_checker = True
-    made.kwargs.pop("render_mode", None)  # of whoever recorded the data; it could open a window
-    with _quiet_loading(made.id):
-        env: Env = gym.make(made, render_mode=render_mode) if render_mode else gym.make(made)  # with the EnvSpec's own
+    spec = EnvSpec.from_json(plain)
+    spec.disable_env_checker = True
+    spec.kwargs.pop("render_mode", None)  # the mode of whoever recorded the data could open a window
+    with _quiet_loading(spec.id):
+        env: Env = gym.make(spec, render_mode=render_mode) if render_mode else gym.make(spec)
     if hasattr(env.unwrapped, "model"):
         from offbench.envs.contact_margins import model_of, set_contacts  # imports MuJoCo, which is slow to load
 

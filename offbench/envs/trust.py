@@ -28,7 +28,7 @@ REMEDY = f"if you trust where it is from, add --trust ({VARIABLE}=1 in Python)"
 # packages whose environments need not be registered; imported D4RL files name gym's
 PACKAGES = ("gymnasium.envs.", "gymnasium_robotics.envs.", "gym.envs.")
 DISTRIBUTIONS = {"gymnasium": "gymnasium", "gymnasium_robotics": "gymnasium-robotics", "gym": "gym"}
-# of gymnasium.wrappers: those for flat spaces that write no file, open no window and take no function
+# wrappers of gymnasium.wrappers for flat spaces that write no file, open no window and take no function
 WRAPPERS = {
     "ClipAction",
     "ClipReward",

@@ -35,7 +35,7 @@ class Evaluation:
 
     Attributes:
         policy: the path of the run or policy file.
-        returns, lengths: of each episode.
+        returns, lengths: return and length of each episode.
         scores: mean normalized score by each reference there is: "dataset", "d4rl".
         physics: the contact margins, if they are not offbench's default.
     """
@@ -74,7 +74,7 @@ def evaluate(
     Args:
         path: a run folder, or a policy file (.safetensors).
         env: a recipe's name or file, instead of the environment that the run or policy names.
-        seed: of the episodes.
+        seed: seed of the episodes.
         stochastic: sample actions (policies that can) instead of taking the mode.
         workers: processes (default: one per core).
 

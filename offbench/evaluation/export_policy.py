@@ -18,7 +18,7 @@ from offbench.rollouts.policy import Policy
 
 TORCHSCRIPT, ONNX = (".pt", ".pth", ".ts"), ".onnx"
 ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
-OPSET, IR_VERSION = 13, 8  # of ONNX: read by every onnxruntime since 1.10
+OPSET, IR_VERSION = 13, 8  # versions of ONNX that every onnxruntime since 1.10 reads
 
 
 class Actor(nn.Module):

@@ -33,7 +33,7 @@ class Similarity:
     """A run's similarity.json.
 
     Attributes:
-        step: of the checkpoint that was evaluated.
+        step: step of the checkpoint.
         samples: transitions drawn from the run's dataset.
         q_similar, action_similar: percent of the samples, by the two readings.
     """

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 ENDINGS = (".gif", ".mp4")
-COLORS = 64  # of a GIF
+COLORS = 64  # colors of a GIF
 STREAM = (int(Purpose.REFERENCE), 3)  # other episodes than those of any measurement
 
 
@@ -59,7 +59,7 @@ def video(
         env: a recipe, instead of the environment that the run or policy names.
         episodes: how many, one after the other.
         seconds: the longest duration (default: whole episodes).
-        seed: of the episodes.
+        seed: seed of the episodes.
         fps: about how many frames per second: videos run in real time, and a frame shows a whole number of steps.
         size: the longer side in pixels.
 

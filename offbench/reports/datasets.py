@@ -89,5 +89,7 @@ def _facts(values: JsonObject) -> list[Cell]:
         *(Cell(f"{values[key]:,}", values[key]) for key in ("transitions", "episodes")),
         *(Cell(f"{values[key]:,.1f}", values[key]) for key in ("return", "std", "score")),
         Cell(f"{100 * values['terminated']:.1f}%", values["terminated"]),
-        Cell(next(iter(values["content_sha256"].values()))[:SHOWN]),  # of the recording whose statistics these are
+        Cell(
+            next(iter(values["content_sha256"].values()))[:SHOWN]
+        ),  # hash of the recording that the statistics describe
     ]

@@ -96,7 +96,7 @@ def _similar_cell(entry: Entry, values: Sequence[Similarity], number: str | None
     """Return the mean by Q, or that there is none because the runs' tolerances or steps differ.
 
     Args:
-        values: of the runs of `entry` that have one.
+        values: the similar scores of the runs of `entry` that have one.
         differ: whether tolerances differ within the table.
     """
     tolerances, steps = (sorted({getattr(value, key) for value in values}) for key in ("tolerance", "step"))

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 KINDS = ("tanh", "squashed_gaussian", "gaussian", "best_by_q", "uniform")
 Layers = tuple[tuple[Array, Array], ...]
-ACTIVATIONS: dict[str, Callable[[Array], Array]] = {  # in place
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {  # they work in place
     "relu": lambda x: np.maximum(x, 0.0, out=x),
     "tanh": lambda x: np.tanh(x, out=x),
 }
@@ -72,7 +72,7 @@ class Policy:
         env_id: the environment it was trained for.
         origin: provenance, anything JSON: algorithm, training step, dataset, seed.
         activation: between layers, a key of ACTIVATIONS.
-        critic, samples: of the kind `best_by_q`: layers of Q, and how many actions it chooses from.
+        critic, samples: only for the kind `best_by_q`: layers of Q, and the number of actions to choose from.
     """
 
     kind: str

@@ -98,7 +98,7 @@ def _machine() -> Iterator[tuple[str, str]]:
 
 def _gpu() -> Iterator[tuple[str, str]]:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a driver that is too old: the result says so
+        warnings.simplefilter("ignore")  # about a driver that is too old: the result says so
         import torch
 
         if torch.cuda.is_available():

@@ -229,7 +229,7 @@ class Run:
                 are not those at which config.json has evaluations.
         """
         if not self.evaluations_path.exists():
-            if self.has_checkpoint:  # which is written after it
+            if self.has_checkpoint:  # written after it
                 raise DamagedError(f"{self.evaluations_path} is missing; put it back, or delete the run to repeat it")
             return {}
         config = self.config() if self.config_path.exists() else None

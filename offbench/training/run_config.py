@@ -37,7 +37,7 @@ class RunConfig:
         references: (random, expert) returns by name: `dataset`, its own, and `d4rl`, D4RL's constants.
         env_spec: the environment it is evaluated in, as EnvSpec JSON; None if the dataset names none.
         env_code: hashes of that environment's code and files, if it is not Gymnasium's; empty in earlier versions.
-        device, precision, versions, hardware: of the first session.
+        device, precision, versions, hardware: the platform of the first session.
         code: hashes of the algorithm's files (offbench.training.source_code); empty in runs of earlier versions.
         sessions: the later sessions that were trained with something else.
         label: the method's name in tables, if a grid gives one.

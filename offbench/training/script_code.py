@@ -27,8 +27,8 @@ def script_code(
     """Return {name: hash} of classes of `__main__`, of what they use there, and of files beside it that they use.
 
     Args:
-        source_hash: of source text.
-        file_hashes: of a file and the files that it imports.
+        source_hash: the hash of source text.
+        file_hashes: the hashes of a file and the files that it imports.
     """
     hashes = {cls.__qualname__: _hash(cls, source_hash) for cls in classes}
     used: dict[str, object] = {}  # what is found is looked through in turn
@@ -62,7 +62,7 @@ def _used_by_class(cls: type) -> Iterator[tuple[str, object]]:
             found = [getattr(value, "__func__", value)]
         for one in found:
             if isinstance(one, types.FunctionType):
-                yield one.__code__.co_qualname, one  # of a decorator, its own name
+                yield one.__code__.co_qualname, one  # for a decorator, its own name
             elif isinstance(one, type) or not name.startswith("__"):
                 yield f"{cls.__qualname__}.{name}", one
 
@@ -96,7 +96,7 @@ def _is_plain(value: object) -> bool:
 
 def _hash(one: type | types.FunctionType, source_hash: Callable[[str], str]) -> str:
     """Return the hash of a class's or function's source; where Python does not know it, that of the compiled code."""
-    source = one if isinstance(one, type) else one.__code__  # of a decorated function, not of what it decorates
+    source = one if isinstance(one, type) else one.__code__  # for a decorated function, that of the decorator
     try:
         return source_hash(inspect.cleandoc("\n" + inspect.getsource(source)))
     except (OSError, TypeError, SyntaxError):

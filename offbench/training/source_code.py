@@ -23,7 +23,7 @@ from offbench.training.script_code import script_code
 if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
 
-_codes: dict[type, dict[str, str]] = {}  # of the imported classes: their files may have changed since
+_codes: dict[type, dict[str, str]] = {}  # of classes as imported: their files may have changed since
 
 
 def code_of(algorithm: str) -> dict[str, str]:

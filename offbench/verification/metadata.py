@@ -17,7 +17,7 @@ from offbench.verification.findings import Findings, Report
 from offbench.verification.scan import ScanResult
 
 SIGMAS = 6  # standard errors that a level's mean return may deviate by,
-SLACK = 0.02  # in addition to this share of the references' distance: rungs are chosen by their measured return
+SLACK = 0.02  # additional tolerance, as a share of the references' distance: rungs are chosen by their measured return
 
 
 def check_recorded_metadata(

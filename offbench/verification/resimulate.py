@@ -23,7 +23,7 @@ from offbench.rollouts.rollouts import cached_envs, reset, step
 STEPS = 40  # most steps of an episode that are replayed one at a time
 WHOLE, CLOSE, ROUNDED = 1e-9, 1e-6, 1e-4  # tolerances: same physics, other version, observations kept as float32
 CLIPPED_VELOCITY = 10.0  # Hopper and Walker2d report no velocity beyond it: the state cannot be recovered there
-SHARE = 0.01  # of the replayed steps, or one step, may differ because rounding changes a contact or a limit
+SHARE = 0.01  # share of the replayed steps that may differ (at least one): rounding can change a contact or a limit
 
 
 @dataclass(frozen=True)

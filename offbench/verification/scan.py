@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from minari import MinariDataset
 
 MIN_CLIPPED = 10  # fewest equal actions at a least or greatest value that count as clipped,
-MIN_CLIPPED_SHARE = 0.001  # and their least share of all actions
+MIN_CLIPPED_SHARE = 0.001  # their minimum share of all actions
 INSIDE = 1e-4  # share of the space's range: a value nearer than this to the space's bound counts as the bound
 
 
