@@ -28,11 +28,11 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import (
     JsonObject,
     csv_bytes,
-    damage,
     delete,
-    disk_errors,
+    read_errors,
     read_json,
     write_bytes,
+    write_errors,
     write_json,
 )
 from offbench.common.provenance import PHYSICS, versions
@@ -44,7 +44,7 @@ from offbench.rollouts.policy import Policy, load_policy, uniform
 from offbench.rollouts.rollouts import MEASURES, EpisodeStats, Rollouts, summary
 
 EXPERT_CANDIDATES = 8  # late rungs measured to choose the expert
-MOST_MEASURED = 6  # policies measured to find the one nearest a return
+MAX_MEASURED = 6  # policies measured to find the one nearest a return
 CROSSINGS = 3  # pairs of neighboring rungs between which policies within a segment are screened
 MEASURED = "measured.json"  # the file in a training's folder from which an interrupted build resumes
 COLUMNS = ("step", "hours", "role", "policy", *MEASURES, *(f"deterministic_{m}" for m in MEASURES), "episodes")
@@ -83,7 +83,7 @@ class RungEvaluator:
         path = self.folder.path / MEASURED
         if not path.exists():
             return
-        with damage(str(path), "is damaged", "delete it"):
+        with read_errors(str(path), "is damaged", "delete it"):
             table = read_json(path, "delete it")
             if table["made"] == self._conditions():
                 self._earlier = {name: dict(table[name]) for name in self._earlier}
@@ -177,10 +177,10 @@ class RungEvaluator:
     def _first_close(self, steps: Sequence[int], target: float, close: float) -> int | None:
         """Measure the most promising policies in turn; return the first within `close` of `target`, if one is.
 
-        The policy with the nearest estimated return comes first. The search ends after MOST_MEASURED policies, or when
+        The policy with the nearest estimated return comes first. The search ends after MAX_MEASURED policies, or when
         a measured policy is nearer than the estimates of all others.
         """
-        for _ in range(MOST_MEASURED if steps else 0):
+        for _ in range(MAX_MEASURED if steps else 0):
             step = min(steps, key=lambda step: abs(self.estimate(step) - target))
             measured = step in self.measured
             if abs(self.measure(step) - target) <= close:
@@ -289,7 +289,7 @@ def _write(out: Path, evaluator: RungEvaluator, roles: dict[int, str], info: Jso
     """Write the ladder to a temporary folder, then rename it; ladder.json, written last, says it is complete."""
     folder = evaluator.folder
     temporary = out.with_name(f".{out.name}.partial")
-    with disk_errors(str(out)):
+    with write_errors(str(out)):
         restore_replaced(out)
         delete(temporary)
         (temporary / "policies").mkdir(parents=True)

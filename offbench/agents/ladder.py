@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from offbench.common.code_hash import changes
+from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, damage, disk_errors, exclusive_lock, open_regular, read_json
-from offbench.common.scores import LARGEST_VALUE, are_references, normalize
+from offbench.common.files import JsonObject, exclusive_lock, open_regular, read_errors, read_json, write_errors
+from offbench.common.scores import MAX_VALUE, are_references, normalize
 from offbench.common.settings import read_back
 from offbench.common.terminal import inform, warn
 from offbench.envs.environment_code import environment_code
@@ -128,8 +128,8 @@ class Ladder:
         """Read a rung's policy."""
         return load_policy(self.folder / "policies" / rung.policy)
 
-    def check(self, recipe: Recipe) -> Ladder:
-        """Return itself; raise OffbenchError if it is of another environment than the recipe."""
+    def check(self, recipe: Recipe) -> None:
+        """Raise OffbenchError if the ladder is of another environment than the recipe."""
         kwargs = json.loads(json.dumps(dict(recipe.env_kwargs)))
         built = (self.info.env_id, self.info.env_kwargs, self.info.contact_margin)
         wanted = (recipe.env_id, kwargs, recipe.contact_margin)
@@ -139,12 +139,11 @@ class Ladder:
                 f"the ladder in {self.folder} is of {old}, the recipe is of {new}; delete that folder, or rename "
                 "the recipe"
             )
-        if changed := changes(self.info.env_code, environment_code(recipe.env_spec())):
+        if changed := describe_changes(self.info.env_code, environment_code(recipe.env_spec())):
             raise OffbenchError(
                 f"the behaviour agent in {self.folder.parent} was trained in other code of its environment: {changed}"
                 "; delete that folder to train it again"
             )
-        return self
 
     @property
     def replay(self) -> Path:
@@ -159,13 +158,13 @@ def read_ladder(folder: Path) -> Ladder | None:
     remedy = f"delete {folder} and build it again with `offbench behaviour`"
     path = folder / "ladder.json"
     info = read_back(LadderInfo, read_json(path, remedy), path, remedy)
-    with damage(f"the ladder in {folder}", "is damaged", remedy):
+    with read_errors(f"the ladder in {folder}", "is damaged", remedy):
         with open(folder / "ladder.csv", newline="", encoding="utf-8", opener=open_regular) as file:
             rungs = tuple(_rung(row) for row in csv.DictReader(file) if row["policy"])
         ladder = Ladder(folder, info, rungs)
         numbers = [info.references[name][key] for name in ("random", "expert") for key in REFERENCE]
-        if not all(abs(number) < LARGEST_VALUE for number in numbers):
-            raise ValueError(f"its references must be finite and below {LARGEST_VALUE:g}")
+        if not all(abs(number) < MAX_VALUE for number in numbers):
+            raise ValueError(f"its references must be finite and below {MAX_VALUE:g}")
         if not are_references(ladder.random_return, ladder.expert_return):
             raise ValueError("its references are equal, or out of order")
         if not (info.levels["medium"] and ladder.role("medium") and ladder.role("expert")):
@@ -216,7 +215,7 @@ def restore_replaced(folder: Path) -> None:
     """Restore a ladder whose writer was killed between its two renames; the training's lock must be held."""
     old = replaced_folder(folder)
     if not folder.exists() and (old / "ladder.json").is_file():
-        with disk_errors(str(folder)):
+        with write_errors(str(folder)):
             old.replace(folder)
 
 

@@ -21,8 +21,8 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import damage, read_bytes, sha256, write_bytes
-from offbench.common.hdf5_file import MOST_COMPRESSED, stored_elsewhere
+from offbench.common.files import read_bytes, read_errors, sha256, write_bytes
+from offbench.common.hdf5_file import MAX_COMPRESSION, stored_elsewhere
 from offbench.rollouts.rollouts import Episode
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def load_replay(
         raise OffbenchError(
             f"{path} is damaged (its SHA-256 differs from the ladder's); reinstall, or build the ladder again"
         )
-    with damage(str(path), "is damaged", "build the ladder again with `offbench behaviour`"):
+    with read_errors(str(path), "is damaged", "build the ladder again with `offbench behaviour`"):
         arrays = _arrays(data, observations.shape[0], len(low))
     span = (high.astype(np.float64) - low) / 2
     row = step = 0
@@ -135,7 +135,7 @@ def _arrays(data: bytes, obs: int, act: int) -> dict[str, Array]:
         columns = {name: file[name] for name in ("observations", "actions", "rewards", "lengths", "terminated")}
         for name, column in columns.items():
             dtype_kinds = {"lengths": "iu", "terminated": "biu"}.get(name, "f")
-            if column.dtype.kind not in dtype_kinds or column.nbytes > MOST_COMPRESSED * len(data):
+            if column.dtype.kind not in dtype_kinds or column.nbytes > MAX_COMPRESSION * len(data):
                 raise ValueError(f"{name} are {column.dtype} {column.shape}")
         arrays: dict[str, Array] = {name: column[()] for name, column in columns.items()}
     steps, episodes = len(arrays["rewards"]), len(arrays["lengths"])

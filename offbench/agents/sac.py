@@ -35,14 +35,14 @@ from offbench.agents.sac_checkpoint import restore, save_segment_end, save_withi
 from offbench.agents.sb3_zip import sac_layers
 from offbench.agents.training_folder import TrainingFolder, read_rungs
 from offbench.common import checkpoints, seeds
-from offbench.common.code_hash import changes
+from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError
 from offbench.common.files import (
     JsonObject,
     csv_bytes,
-    disk_errors,
     read_json,
     write_bytes,
+    write_errors,
     write_json,
 )
 from offbench.common.interrupts import collect_stop_signals
@@ -63,11 +63,11 @@ RUNG_COLUMNS = (
     *(f"{how}_{m}" for how in ("stochastic", "deterministic") for m in MEASURES),
     "episodes",
 )
-MOST_POLICIES = 100  # most policies kept of a segment, its rung included
-POLICY_BYTES = 6_000_000  # most bytes of a segment's policies: 20 of hopper's
+MAX_POLICIES = 100  # saved policies of a segment, including its rung
+MAX_POLICY_BYTES = 6_000_000  # bytes of a segment's policies: 20 of hopper's
 LARGE_CHANGE = 0.05  # share of the range of returns; after a smaller change, policies within a segment are deleted
 STEP_WORK = 0.02  # time of an environment step in units of gradient steps, to estimate the time left
-PROBE = 1.0  # most seconds spent on estimating the training's time
+MAX_PROBE_SECONDS = 1.0  # time spent on estimating the training's time
 PROBE_CYCLES, WARM_UP = 50, 4
 
 
@@ -96,7 +96,7 @@ def _check_identity(folder: TrainingFolder) -> None:
         write_json(path, identity | {"env_code": code} | made)
         return
     recorded = read_json(path, f"delete {folder.path} to train the agent again")
-    if edited := changes(recorded.get("env_code", {}), code):
+    if edited := describe_changes(recorded.get("env_code", {}), code):
         raise OffbenchError(
             f"the training in {folder.path} began in other code of its environment: {edited}; delete it to train again"
         )
@@ -184,7 +184,7 @@ def _measure_gradient_step(recipe: Recipe, env_spec: str) -> float:
     model = _make_sac(dataclasses.replace(recipe, sac=settings), env_spec, (WARM_UP + PROBE_CYCLES) * cycle)
     model.learn(WARM_UP * cycle, log_interval=sys.maxsize)
     start, first = time.monotonic(), model.num_timesteps
-    while time.monotonic() - start < PROBE and model.num_timesteps < (WARM_UP + PROBE_CYCLES) * cycle:
+    while time.monotonic() - start < MAX_PROBE_SECONDS and model.num_timesteps < (WARM_UP + PROBE_CYCLES) * cycle:
         model.learn(cycle, reset_num_timesteps=False, log_interval=sys.maxsize)
     done = _work(settings, model.num_timesteps) - _work(settings, first)
     assert model.env is not None
@@ -251,7 +251,7 @@ def _train_segment(folder: TrainingFolder, model: SAC, progress: Progress, stops
     start = model.num_timesteps // settings.segment * settings.segment
     end, cycle = start + settings.segment, settings.cycle()[0] * settings.envs
     keep_every = cycle * math.ceil(
-        settings.segment / cycle / min(MOST_POLICIES, max(POLICY_BYTES // _actor_bytes(model), 1))
+        settings.segment / cycle / min(MAX_POLICIES, max(MAX_POLICY_BYTES // _actor_bytes(model), 1))
     )
     if model.num_timesteps == start:
         _start_segment(folder, model, start)
@@ -284,7 +284,7 @@ def _end_segment(
     policy = _export(folder, model)
     row = {"step": step, "hours": round(seconds / 3600, 4)} | _screen(folder, rollouts, policy, step)
     returns = [before["stochastic_return"] for before in (*rows, row)]
-    with disk_errors(str(folder.path)):
+    with write_errors(str(folder.path)):
         policy.save(folder.policy(step))
         if len(returns) > 1 and abs(returns[-1] - returns[-2]) < LARGE_CHANGE * (max(returns) - min(returns)):
             for other in folder.policy_steps():

@@ -20,7 +20,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from offbench.agents.training_folder import TRANSITIONS, TrainingFolder
 from offbench.common import checkpoints
 from offbench.common.arrays import Array
-from offbench.common.files import JsonObject, disk_errors
+from offbench.common.files import JsonObject, write_errors
 from offbench.common.terminal import warn
 
 OPTIMIZERS = ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer")
@@ -49,7 +49,7 @@ def save_within_segment(folder: TrainingFolder, model: SAC, seconds: float) -> N
     numpy_state["state"]["key"] = numpy_state["state"]["key"].tolist()
     generators = {"numpy": numpy_state, "action_space": model.action_space.np_random.bit_generator.state}
     state = _state(model, seconds) | {"generators": generators}
-    with disk_errors(str(folder.path)):
+    with write_errors(str(folder.path)):
         checkpoints.save_checkpoint(folder.path, step, _tensors(model) | tensors, state)
         _keep_newest(folder, step)
 

@@ -20,10 +20,10 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, damage, open_regular
+from offbench.common.files import JsonObject, open_regular, read_errors
 from offbench.rollouts.policy import ACTIVATIONS, Layers, Policy
 
-LARGEST = 2**30  # bytes of a member, unpacked
+MAX_MEMBER_SIZE = 2**30  # bytes of a member, unpacked
 FLATTEN = "<class 'stable_baselines3.common.torch_layers.FlattenExtractor'>"  # leaves vectors as they are
 
 
@@ -38,7 +38,7 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
             observations that VecNormalize has normalized (recognized for PPO and A2C only).
     """
     try:
-        with damage(str(path), "is not a readable zip of Stable-Baselines3", "save the agent again"):
+        with read_errors(str(path), "is not a readable zip of Stable-Baselines3", "save the agent again"):
             tensors, settings = _read(path)
     except FileNotFoundError:
         raise OffbenchError(f"no file {path}") from None
@@ -77,8 +77,8 @@ def _read(path: Path) -> tuple[dict[str, Array], JsonObject]:
 
     with open(path, "rb", opener=open_regular) as file, zipfile.ZipFile(file) as archive:
         for name in ("policy.pth", "data"):
-            if archive.getinfo(name).file_size > LARGEST:
-                raise ValueError(f"{name} is larger than {LARGEST:,} bytes")
+            if archive.getinfo(name).file_size > MAX_MEMBER_SIZE:
+                raise ValueError(f"{name} is larger than {MAX_MEMBER_SIZE:,} bytes")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about old formats: their content is checked below
             try:

@@ -19,7 +19,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import damage, exclusive_lock, open_regular, read_text, remove_leftovers
+from offbench.common.files import exclusive_lock, open_regular, read_errors, read_text, remove_leftovers
 from offbench.envs.recipes import Recipe
 
 TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -67,7 +67,7 @@ class TrainingFolder:
         path, remedy = self.transitions(step), f"delete {self.path} to train the agent again"
         try:
             with (
-                damage(str(path), "is damaged", remedy),
+                read_errors(str(path), "is damaged", remedy),
                 open(path, "rb", opener=open_regular) as file,
                 np.load(file, allow_pickle=False) as arrays,
             ):
@@ -80,7 +80,7 @@ def read_rungs(path: Path) -> list[dict[str, float]]:
     """Read rungs.csv (an empty list if there is none yet). Raises OffbenchError if it is damaged."""
     if not path.exists():
         return []
-    with damage(str(path), "is damaged", "delete its folder to train the agent again"):
+    with read_errors(str(path), "is damaged", "delete its folder to train the agent again"):
         lines = read_text(path).splitlines()
         header = lines[0].split(",")
         rows = [dict(zip(header, map(float, line.split(",")), strict=True)) for line in lines[1:]]

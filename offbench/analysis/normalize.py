@@ -112,12 +112,14 @@ def score_returns(env: str | Path, returns: Sequence[float]) -> list[Row]:
         OffbenchError: unknown environment, a return that is not finite, or no reference at all.
     """
     recipe = load_recipe(env)
-    if not all(abs(value) < scores.LARGEST_VALUE for value in returns):
-        raise OffbenchError(f"returns must be finite numbers below {scores.LARGEST_VALUE:g}, not {list(returns)}")
+    if not all(abs(value) < scores.MAX_VALUE for value in returns):
+        raise OffbenchError(f"returns must be finite numbers below {scores.MAX_VALUE:g}, not {list(returns)}")
     ladder = shipped_ladder(recipe) or read_ladder(folder_of(recipe, 0, BEHAVIOUR) / "ladder")
-    ours = (ladder.random_return, ladder.expert_return) if ladder and ladder.check(recipe) else None
+    if ladder:
+        ladder.check(recipe)
+    own_reference = (ladder.random_return, ladder.expert_return) if ladder else None
     d4rl = recipe.d4rl_reference()
-    if not ours and not d4rl:
+    if not own_reference and not d4rl:
         raise OffbenchError(
             f"{env} has no reference scores yet; measure them with `offbench behaviour {shlex.quote(str(env))}`"
         )
@@ -125,7 +127,7 @@ def score_returns(env: str | Path, returns: Sequence[float]) -> list[Row]:
         {
             "environment": recipe.env_id,
             "return": value,
-            "score": scores.normalize(value, *ours) if ours else None,
+            "score": scores.normalize(value, *own_reference) if own_reference else None,
             "d4rl_score": scores.normalize(value, *d4rl) if d4rl else None,
         }
         for value in returns

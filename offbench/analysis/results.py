@@ -20,7 +20,7 @@ import numpy as np
 from offbench.analysis.evaluated_run import EvaluatedRun, keys_with_mixed_code
 from offbench.analysis.methods import Method, find_method, method_order, name_methods, rank
 from offbench.common.arrays import Array
-from offbench.common.code_hash import changes
+from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import READ_REMEDIES
 from offbench.common.scores import SCORED_EVALUATIONS, mean_std
@@ -307,7 +307,7 @@ def _check_evaluated_alike(one: EvaluatedRun, other: EvaluatedRun) -> None:
         differ = "were evaluated in different environments"
     elif any(pair and b.references.get(name) not in (None, pair) for name, pair in a.references.items()):
         differ = "have different reference scores"
-    elif changes(a.env_code, b.env_code):
+    elif describe_changes(a.env_code, b.env_code):
         differ = "were evaluated in environments of different code"
     else:
         return

@@ -72,7 +72,7 @@ def _differences(metadata: JsonObject, dataset: GridDataset, recipe: Recipe) -> 
         yield f"environment {env_id}" + (
             f", not {recipe.env_id}" if env_id != recipe.env_id else " with other settings"
         )
-    provenance = minari_store.provenance(metadata)
+    provenance = minari_store.read_provenance(metadata)
     if provenance.level is not None and _level_name(provenance.level) != _level_name(dataset.level):
         yield f"level {provenance.level}, not {dataset.level}"
     if provenance.contact_margin not in (None, recipe.contact_margin):

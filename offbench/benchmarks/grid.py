@@ -23,9 +23,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from offbench.common.errors import OffbenchError, unknown
-from offbench.common.files import JsonObject, damage, read_text
+from offbench.common.files import JsonObject, read_errors, read_text
 from offbench.common.settings import build, short_repr
-from offbench.common.text import LARGEST_INTEGER, MOST_SEEDS
+from offbench.common.text import MAX_INT, MAX_SEEDS
 from offbench.data import minari_store
 from offbench.data.levels import env_and_level, level_argument, parse_level, recipe_and_level
 from offbench.envs.recipes import load_recipe
@@ -97,7 +97,7 @@ def load_grid(name: str) -> Grid:
         raise unknown("grid", name, shipped_grids())
     where = path.name
     try:
-        with damage(where, "is not a readable TOML file", "correct it, or give another"):
+        with read_errors(where, "is not a readable TOML file", "correct it, or give another"):
             values = tomllib.loads(read_text(path))
     except FileNotFoundError:
         raise OffbenchError(f"no grid file {path}; shipped grids: {', '.join(shipped_grids())}") from None
@@ -119,9 +119,9 @@ def _schedule(values: JsonObject, default: TrainingSchedule, where: str) -> Trai
     """Return `default` with the changes in `values`."""
     merged = dataclasses.asdict(default) | values
     seeds = merged.pop("seeds")
-    if isinstance(seeds, int) and not isinstance(seeds, bool) and 0 < seeds <= MOST_SEEDS:
+    if isinstance(seeds, int) and not isinstance(seeds, bool) and 0 < seeds <= MAX_SEEDS:
         seeds = range(seeds)
-    bad = not isinstance(seeds, Sequence) or any(type(s) is not int or not 0 <= s <= LARGEST_INTEGER for s in seeds)
+    bad = not isinstance(seeds, Sequence) or any(type(s) is not int or not 0 <= s <= MAX_INT for s in seeds)
     if bad or len(set(seeds)) != len(seeds) or not len(seeds):
         raise OffbenchError(
             f"{where}: seeds must be a count or a list of different whole numbers, not {short_repr(seeds)}"

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 from offbench.common.errors import OffbenchError, nearest
 from offbench.common.terminal import is_terminal
-from offbench.common.text import LARGEST_INTEGER, MOST_SEEDS, whole_number
+from offbench.common.text import MAX_INT, MAX_SEEDS, whole_number
 
 HELP_COLUMN = 28  # where the help of an argument begins, at the latest, on a terminal of 80 columns
 
@@ -173,7 +173,7 @@ def _whole(text: str, least: int) -> int:
         value = least - 1
     if value < least:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}")
-    if value > LARGEST_INTEGER:
+    if value > MAX_INT:
         raise argparse.ArgumentTypeError(f"{text!r:.60} is too large a number")
     return value
 
@@ -209,6 +209,6 @@ def seed_list(text: str) -> list[int]:
         raise argparse.ArgumentTypeError(f"{error}; seeds are 3, 0,1,2 or 0:4 (0 to 3)") from None
     if not seeds:
         raise argparse.ArgumentTypeError(f"{text!r} holds no seed")
-    if len(seeds) > MOST_SEEDS:
-        raise argparse.ArgumentTypeError(f"{text!r} are more than {MOST_SEEDS:,} seeds")
+    if len(seeds) > MAX_SEEDS:
+        raise argparse.ArgumentTypeError(f"{text!r} are more than {MAX_SEEDS:,} seeds")
     return list(seeds)

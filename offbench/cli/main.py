@@ -13,7 +13,7 @@ from typing import Any, NoReturn, TextIO
 from offbench.cli import data, results, tools, training
 from offbench.cli.arguments import Command, Parser
 from offbench.common.errors import OffbenchError, unknown
-from offbench.common.files import disk_errors
+from offbench.common.files import write_errors
 from offbench.common.interrupts import stop_handlers
 from offbench.common.terminal import labeled
 from offbench.common.text import printable
@@ -184,11 +184,11 @@ class _Printable(_Stream):
 
     def write(self, text: str) -> int:
         encoding = self._stream.encoding or "utf-8"
-        with disk_errors("the output"):
+        with write_errors("the output"):
             return self._stream.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
 
     def flush(self) -> None:
-        with disk_errors("the output"):
+        with write_errors("the output"):
             self._stream.flush()
 
 

@@ -13,7 +13,7 @@ from safetensors.torch import save
 
 from offbench.common.arrays import content_sha256
 from offbench.common.errors import DamagedError
-from offbench.common.files import JsonObject, damage, open_regular, write_bytes
+from offbench.common.files import JsonObject, open_regular, read_errors, write_bytes
 from offbench.common.terminal import inform
 
 KEPT = 2
@@ -48,7 +48,7 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], J
     """
     path = path_of(folder, step)
     try:
-        with damage(str(path), "is damaged", "using the one before it"):
+        with read_errors(str(path), "is damaged", "using the one before it"):
             os.close(open_regular(path))  # safe_open would wait for a FIFO
             with safe_open(path, framework="pt") as file:
                 state = json.loads((file.metadata() or {})["offbench"])

@@ -20,8 +20,8 @@ LEFT_OUT = {tokenize.COMMENT, tokenize.NL, tokenize.ENCODING, tokenize.ENDMARKER
 MAIN = "__main__: "  # begins the names of what a class of a script uses there
 
 
-def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """Return what differs between two {file: hash}, for an error line; "" for nothing, or if either is missing."""
+def describe_changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """Return how two {file: hash} differ, for a message; "" if they are equal or one is empty."""
     if not before or not now:
         return ""
     if not set(before) & set(now):

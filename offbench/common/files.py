@@ -60,8 +60,8 @@ def is_exhausted(error: BaseException) -> bool:
 
 
 @contextlib.contextmanager
-def disk_errors(what: str, elsewhere: str = "choose another folder") -> Iterator[None]:
-    """Turn the operating system's errors (full disk, no permission) into one clear line.
+def write_errors(what: str, elsewhere: str = "choose another folder") -> Iterator[None]:
+    """Convert the operating system's errors while writing (full disk, no permission) into an error of one line.
 
     Args:
         what: the file or folder that is written.
@@ -96,7 +96,7 @@ def exclusive_lock(path: Path, what: str, timeout: float = LOCK_TIMEOUT) -> Iter
     from filelock import FileLock, Timeout  # here, so that help comes at once
 
     lock, holder = FileLock(path), path.with_suffix(".holder")
-    with disk_errors(str(path.parent)):
+    with write_errors(str(path.parent)):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             lock.acquire(timeout=timeout)
@@ -104,7 +104,7 @@ def exclusive_lock(path: Path, what: str, timeout: float = LOCK_TIMEOUT) -> Iter
             raise OffbenchError(f"{what} by {_holder(holder)}; wait for it, or stop it") from None
     try:
         _inodes[path] = path.stat().st_ino  # no new file gets this number while the lock is open
-        with disk_errors(str(path.parent)):
+        with write_errors(str(path.parent)):
             holder.unlink(missing_ok=True)
             with open(holder, "x", encoding="utf-8") as file:  # "x" follows no link that lies there
                 file.write(f"process {os.getpid()} on {socket.gethostname()}")
@@ -173,14 +173,14 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
         for path, data in contents.items():
             check_ownership(path)
             temporaries[path] = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-            with disk_errors(str(path)):
+            with write_errors(str(path)):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with open(temporaries[path], "xb") as file:
                     file.write(data)
                     file.flush()
                     os.fsync(file.fileno())
         for path, temporary in temporaries.items():
-            with disk_errors(str(path)):
+            with write_errors(str(path)):
                 os.replace(temporary, path)
     except BaseException as error:
         for temporary in temporaries.values():
@@ -195,7 +195,7 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
 def remove_leftovers(folder: Path) -> None:
     """Delete the unfinished files of killed processes in `folder`, whose lock must be held."""
     for leftover in folder.glob(".*.tmp"):
-        with disk_errors(str(leftover)):
+        with write_errors(str(leftover)):
             delete(leftover)
 
 
@@ -237,7 +237,7 @@ def write_json(path: Path, value: object) -> None:
 def read_json(path: Path, remedy: str = REINSTALL) -> JsonObject:
     """Read the JSON object in a file. Raises OffbenchError if it is missing or damaged: the `remedy` is for that."""
     try:
-        with damage(str(path), "is damaged or not JSON", remedy):
+        with read_errors(str(path), "is damaged or not JSON", remedy):
             value = json.loads(read_text(path))
             json.dumps(value, ensure_ascii=False).encode()  # "\\ud800" is JSON, but cannot be printed or written
             if not isinstance(value, dict):
@@ -257,8 +257,8 @@ def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
 
 
 @contextlib.contextmanager
-def damage(name: str, fault: str, remedy: str) -> Iterator[None]:
-    """Turn any exception raised while a file is read into an error of one line.
+def read_errors(name: str, fault: str, remedy: str) -> Iterator[None]:
+    """Convert any exception raised while reading a file into an error of one line.
 
     Errors of the operating system (a lock, no permission, a failing disk) and missing packages are reported as such,
     all others as damage. A missing file is left to the caller.

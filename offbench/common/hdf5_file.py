@@ -14,7 +14,7 @@ import h5py
 
 from offbench.common.interrupts import collect_stop_signals
 
-MOST_COMPRESSED = 1000  # largest accepted ratio of an array's size to the file's; others are damaged or malicious
+MAX_COMPRESSION = 1000  # ratio of an array's size to the file's; others are damaged or malicious
 
 
 class SafeFile:

@@ -20,7 +20,7 @@ from offbench.common.interrupts import STOP_SIGNALS, delay_stop_signals
 if TYPE_CHECKING:
     from ctypes import c_byte
 
-MOST_WORKERS = 1_000
+MAX_WORKERS = 1_000
 GRACE = 2.0  # seconds that a worker has to end when its pool closes
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -50,17 +50,17 @@ def cores() -> int:
 
 
 def default_workers(workers: int | None) -> int:
-    """Return `workers`, or one per core if it is None. Raises OffbenchError below 1 or above MOST_WORKERS."""
+    """Return `workers`, or one per core if it is None. Raises OffbenchError below 1 or above MAX_WORKERS."""
     if workers is None:
         return cores()
-    if not 1 <= workers <= MOST_WORKERS:
-        raise OffbenchError(f"workers must be from 1 to {MOST_WORKERS:,}, not {workers}")
+    if not 1 <= workers <= MAX_WORKERS:
+        raise OffbenchError(f"workers must be from 1 to {MAX_WORKERS:,}, not {workers}")
     return workers
 
 
 @contextlib.contextmanager
 def start_errors() -> Iterator[None]:
-    """Turn the operating system's errors in starting a process, or in sharing memory with it, into one line."""
+    """Convert the operating system's errors while starting a process, or sharing memory, into an error of one line."""
     try:
         yield
     except OSError as error:

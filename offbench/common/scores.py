@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 Evaluations = Mapping[int, Sequence[tuple[float, int]]]  # {step: [(return, length) of each episode]}
-LARGEST_VALUE = 1e15  # limit of steps, returns and references: scores and their squares stay finite
-SMALLEST_GAP = 1e-12  # between the references of a score
+MAX_VALUE = 1e15  # limit of steps, returns and references: scores and their squares stay finite
+MIN_REFERENCE_GAP = 1e-12  # between the references of a score
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
@@ -29,7 +29,7 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
 
 def are_references(low: float, high: float) -> bool:
     """Return whether returns can be normalized by these two: finite, and the expert's above the random policy's."""
-    return max(abs(low), abs(high)) < LARGEST_VALUE and high - low >= SMALLEST_GAP
+    return max(abs(low), abs(high)) < MAX_VALUE and high - low >= MIN_REFERENCE_GAP
 
 
 def normalize(value: float, low: float, high: float) -> float:

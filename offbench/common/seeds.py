@@ -12,7 +12,7 @@ from enum import IntEnum
 import numpy as np
 
 from offbench.common.errors import OffbenchError
-from offbench.common.text import LARGEST_INTEGER
+from offbench.common.text import MAX_INT
 
 
 class Purpose(IntEnum):
@@ -35,13 +35,13 @@ def check_seed(seed: object) -> int:
     """Return a user's seed as an int.
 
     Raises:
-        OffbenchError: it is not a whole number from 0 to LARGEST_INTEGER.
+        OffbenchError: it is not a whole number from 0 to MAX_INT.
     """
     try:
         number = operator.index(seed)  # type: ignore[arg-type]
     except TypeError:
         number = -1
-    if not 0 <= number <= LARGEST_INTEGER:
+    if not 0 <= number <= MAX_INT:
         raise OffbenchError(f"a seed is a whole number from 0 to 2**63 - 1, not {seed!r:.60}")
     return number
 

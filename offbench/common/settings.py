@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from offbench.common.errors import DamagedError, OffbenchError, unknown
-from offbench.common.text import LARGEST_INTEGER, whole_number
+from offbench.common.text import MAX_INT, whole_number
 
 T = TypeVar("T")
 Field: TypeAlias = dataclasses.Field[Any]
@@ -183,7 +183,7 @@ def _check_range(name: str, value: object, metadata: Mapping[str, Any], where: s
         raise _error(where, f"{name} must be {kind} {', '.join(choices)}, not {value!r}")
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
-    if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+    if isinstance(value, int) and abs(value) > MAX_INT:
         raise _error(where, f"{name} is too large a number")
     low, above, high = metadata.get("low"), metadata.get("above"), metadata.get("high")
     if not math.isfinite(value):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 
-LARGEST_INTEGER = 2**63 - 1  # largest whole number in files
-MOST_SEEDS = 100_000  # most seeds of one command; a larger count is a typing error and would fill the memory
+MAX_INT = 2**63 - 1  # whole numbers in files
+MAX_SEEDS = 100_000  # seeds of one command; a larger count is a typing error and would fill the memory
 
 
 def whole_number(text: str) -> int:

@@ -119,10 +119,10 @@ def _recorded(recipe: Recipe, ladder: Ladder, level: str, collect: str) -> Summa
     if dataset_id not in minari_store.local_ids():
         raise OffbenchError(f"{dataset_id} is not recorded yet; first `{collect} --level {level}`")
     summary = show(dataset_id)
-    ours = minari_store.provenance(summary.metadata)
+    provenance = minari_store.read_provenance(summary.metadata)
     parts = LEVELS[level]
     size = full_size(parts, recipe.dataset_steps, ladder.info.medium_replay.transitions)
-    same = ours.references == ladder.info.references and ours.seed == 0
+    same = provenance.references == ladder.info.references and provenance.seed == 0
     if not same or int(summary.lengths.sum()) != size:
         raise OffbenchError(
             f"{dataset_id} does not match the card (seed 0, {size:,.0f} transitions, the references of this ladder); "
@@ -145,7 +145,7 @@ def _facts(recipe: Recipe, summary: Summary) -> JsonObject:
         "score": round(normalize(mean, float(meta["ref_min_score"]), float(meta["ref_max_score"])), 2) + 0.0,  # no -0
         "d4rl_score": round(normalize(mean, *d4rl), 2) if d4rl else None,
         "terminated": round(summary.terminated, 4),
-        "content_sha256": minari_store.provenance(meta).content_sha256,
+        "content_sha256": minari_store.read_provenance(meta).content_sha256,
     }
 
 

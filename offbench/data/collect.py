@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from offbench.agents.ladder import BEHAVIOUR, Ladder, find_ladder
-from offbench.common.code_hash import changes
+from offbench.common.code_hash import describe_changes
 from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import JsonObject
 from offbench.common.processes import default_workers
@@ -131,11 +131,13 @@ def _is_same(dataset_id: str, wanted: JsonObject) -> bool:
     Raises:
         DamagedError: its data cannot be opened.
     """
-    recorded = minari_store.provenance(minari_store.read_metadata(dataset_id))
-    new = minari_store.provenance(json.loads(json.dumps({minari_store.KEY: wanted[minari_store.KEY]})))  # as written
+    recorded = minari_store.read_provenance(minari_store.read_metadata(dataset_id))
+    new = minari_store.read_provenance(
+        json.loads(json.dumps({minari_store.KEY: wanted[minari_store.KEY]}))
+    )  # as written
     same = all(recorded.versions.get(name) == new.versions.get(name) for name in PHYSICS)
     same = same and all(getattr(recorded, key) == getattr(new, key) for key in IDENTITY)
-    if same and (changed := changes(recorded.env_code, new.env_code)):
+    if same and (changed := describe_changes(recorded.env_code, new.env_code)):
         raise OffbenchError(
             f"{dataset_id} was recorded in other code of its environment: {changed}; use --overwrite to replace it, "
             "or --id for another id"

@@ -13,7 +13,7 @@ from minari.serialization import deserialize_space
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
-from offbench.common.hdf5_file import MOST_COMPRESSED
+from offbench.common.hdf5_file import MAX_COMPRESSION
 from offbench.data import minari_store
 from offbench.envs.environments import parse_spec
 
@@ -88,7 +88,7 @@ def _check(path: Path, columns: dict[str, h5py.Dataset]) -> None:
         wide = column.ndim == 2 and column.shape[0] == rows and column.shape[1] > 0 and name in _WIDE
         if not (flat or wide) or column.dtype.kind not in "fiub":
             raise OffbenchError(f"{path}: {name} {column.shape} {column.dtype} does not fit {rows:,} rows")
-        if column.nbytes > MOST_COMPRESSED * (path.stat().st_size + 1000):
+        if column.nbytes > MAX_COMPRESSION * (path.stat().st_size + 1000):
             raise OffbenchError(f"{path}: {name} claims {column.nbytes / 1e9:.0f} GB, more than the file can hold")
     if "next_observations" in columns and columns["next_observations"].shape != columns["observations"].shape:
         raise OffbenchError(f"{path}: next_observations {columns['next_observations'].shape} differ from observations")

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from offbench.common.errors import OffbenchError
-from offbench.common.files import disk_errors, exclusive_lock
+from offbench.common.files import exclusive_lock, write_errors
 from offbench.common.processes import environment
 from offbench.common.text import printable
 from offbench.data import minari_store
@@ -34,7 +34,7 @@ def download(dataset_id: str) -> None:
         try:
             with environment({"MINARI_DATASETS_PATH": str(temporary)}):
                 _fetch(dataset_id)
-            with disk_errors(str(root)):
+            with write_errors(str(root)):
                 _move(temporary, root)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)

@@ -22,7 +22,7 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, disk_errors, output_file
+from offbench.common.files import JsonObject, output_file, write_errors
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.common.progress import Progress
 from offbench.data import minari_store
@@ -64,7 +64,7 @@ def export(dataset_id: str, out: str | Path, *, style: str | None = None, drop_t
     if drop_timeouts and style == "d4rl":
         raise OffbenchError("--drop-timeouts goes with --format npz: readers of D4RL files drop them")
     path = output_file(out)
-    with disk_errors(str(path)), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+    with write_errors(str(path)), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         temporary = Path(folder) / path.name
         with unchanged(dataset_id):
             _write(dataset_id, temporary, style, drop_timeouts)
@@ -86,7 +86,7 @@ def _write(dataset_id: str, path: Path, style: str, drop_timeouts: bool) -> None
         if style == "d4rl":
             _write_d4rl(path, columns, _about(metadata))
         else:
-            dropped = minari_store.provenance(metadata).timeouts == "dropped"
+            dropped = minari_store.read_provenance(metadata).timeouts == "dropped"
             _write_npz(path, (_float32(part, dataset_id) for part in columns), drop_timeouts, dropped)
     minari_store.check_content(dataset_id, metadata, content.hexdigest())
 

@@ -13,7 +13,7 @@ from offbench.data import minari_store
 from offbench.data.show import Summary, format_value, show, space
 
 SIZES = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M", 10_000_000: "1M<n<10M"}
-LARGEST = "10M<n<100M"
+MAX_SIZE_CATEGORY = "10M<n<100M"
 
 
 def huggingface_card(dataset_id: str, out: str | Path | None = None) -> Path:
@@ -43,14 +43,14 @@ def _header(summary: Summary) -> Iterator[str]:
     yield f"pretty_name: {json.dumps(summary.dataset_id)}"
     yield "task_categories: [reinforcement-learning]"
     yield "tags: [reinforcement-learning, offline-rl, minari, gymnasium]"
-    size = next((name for most, name in SIZES.items() if steps < most), LARGEST)
+    size = next((name for most, name in SIZES.items() if steps < most), MAX_SIZE_CATEGORY)
     yield f'size_categories: ["{size}"]'
     yield "viewer: false"  # the Hub cannot show HDF5
     yield "---"
 
 
 def _text(summary: Summary) -> Iterator[str]:
-    meta, ours, dataset_id = summary.metadata, minari_store.provenance(summary.metadata), summary.dataset_id
+    meta, provenance, dataset_id = summary.metadata, minari_store.read_provenance(summary.metadata), summary.dataset_id
     yield f"# {plain(dataset_id)}"
     yield from ("", plain(str(meta.get("description") or "A Minari dataset.")), "")
     yield from ("## Use", "", "Replace USER by the account of this page:", "", "```sh")
@@ -62,13 +62,13 @@ def _text(summary: Summary) -> Iterator[str]:
     yield from (f"offbench verify {dataset_id}", f"offbench train td3_bc --dataset {dataset_id}", "```")
     yield from ("", "## Content", "")
     yield from _table(_content(summary))
-    for number, part in enumerate(ours.parts or (), 1):
+    for number, part in enumerate(provenance.parts or (), 1):
         yield from ("", f"## Part {number}", "")
         yield from _table({key.replace("_", " "): format_value(value) for key, value in part.items()})
     yield from ("", "## Provenance", "")
-    origin = {name: getattr(ours, name) for name in ("env", "level", "seed", "recipe_sha256", "content_sha256")}
-    origin["imported from"] = ours.imported.get("file")
-    origin |= ours.versions
+    origin = {name: getattr(provenance, name) for name in ("env", "level", "seed", "recipe_sha256", "content_sha256")}
+    origin["imported from"] = provenance.imported.get("file")
+    origin |= provenance.versions
     recorded = {name.replace("_", " "): format_value(value) for name, value in origin.items() if value is not None}
     yield from _table(recorded) if recorded else ["Not recorded by offbench."]
 

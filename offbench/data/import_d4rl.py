@@ -27,7 +27,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, damage, sha256_of
+from offbench.common.files import JsonObject, read_errors, sha256_of
 from offbench.common.progress import Progress
 from offbench.common.provenance import versions
 from offbench.common.terminal import inform, warn
@@ -81,7 +81,7 @@ def import_d4rl(file: str | Path, dataset_id: str, *, env: str | Path | None = N
         raise OffbenchError(f"no file {path}")
     try:
         with (
-            damage(str(path), "is not a readable D4RL file", "download or export it again"),
+            read_errors(str(path), "is not a readable D4RL file", "download or export it again"),
             h5py.File(path) as opened,
         ):
             source = read_source(path, opened)
@@ -309,14 +309,14 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
     about, complete = source.about, "next_observations" in source.columns
     fields = {key: about[key] for key in (*NUMBERS, "requirements") if key in about}
     fields |= {key: set(about[key]) for key in ("author", "author_email") if key in about}
-    ours: JsonObject = {
+    provenance: JsonObject = {
         "format": "offbench-import-1",
         "timeouts": "kept" if complete else "dropped",
         "final_observations": "kept" if complete else "repeated",
         "d4rl": d4rl_reference(origin.recorded),
     }
-    ours |= about.get(minari_store.KEY, {})
-    ours["imported"] = {
+    provenance |= about.get(minari_store.KEY, {})
+    provenance["imported"] = {
         "file": source.path.name,
         "sha256": sha256_of(source.path),
         "offbench": versions()["offbench"],
@@ -327,7 +327,7 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
         "minari_version": versions()["minari"],
         "algorithm_name": about.get("algorithm_name", "unknown"),
         "description": about.get("description", f"D4RL file {source.path.name}{where}."),
-        minari_store.KEY: ours,
+        minari_store.KEY: provenance,
     }
     if origin.evaluated:
         metadata["eval_env_spec"], rule = without_margin(origin.evaluated)
@@ -337,11 +337,11 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
         if before and not same_environment(before, origin.evaluated):
             warn(f"--env names another environment than {source.path} does, so its reference scores are left out")
             metadata = {key: value for key, value in metadata.items() if key not in ("ref_min_score", "ref_max_score")}
-            ours = {key: value for key, value in ours.items() if key not in ("references", MARGIN_KEY)}
-            ours["d4rl"] = d4rl_reference(metadata["eval_env_spec"])
+            provenance = {key: value for key, value in provenance.items() if key not in ("references", MARGIN_KEY)}
+            provenance["d4rl"] = d4rl_reference(metadata["eval_env_spec"])
         if rule == SUM_RULE:
-            ours[MARGIN_KEY] = rule
-        metadata[minari_store.KEY] = ours
+            provenance[MARGIN_KEY] = rule
+        metadata[minari_store.KEY] = provenance
     return metadata, _spaces(source, origin.recipe)
 
 

@@ -16,7 +16,7 @@ from gymnasium.spaces import Box
 
 from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError
-from offbench.common.files import damage, open_regular
+from offbench.common.files import open_regular, read_errors
 from offbench.common.hdf5_file import stored_elsewhere
 from offbench.data import minari_store
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from minari import EpisodeData, MinariDataset
 
 RECORD_AGAIN = "record or download it again"
-LARGEST = float(np.finfo(np.float32).max)
+MAX_FLOAT32 = float(np.finfo(np.float32).max)
 
 
 @contextlib.contextmanager
@@ -36,7 +36,7 @@ def reading(dataset_id: str) -> Iterator[None]:
         OffbenchError: its files are locked, may not be read, or need a package that is not installed.
     """
     try:
-        with damage(dataset_id, "is damaged", RECORD_AGAIN):
+        with read_errors(dataset_id, "is damaged", RECORD_AGAIN):
             yield
     except FileNotFoundError as error:
         raise DamagedError(
@@ -162,8 +162,10 @@ def finite(array: Array, what: str) -> Array:
 def float32(array: Array, what: str) -> Array:
     """Return finite numbers as float32. Raises OffbenchError if they are anything else, or too large for float32."""
     largest = float(np.abs(finite(array, what)).max(initial=0))
-    if largest > LARGEST:
-        raise OffbenchError(f"{what} reach {largest:.3g}, beyond float32's {LARGEST:.2g}; scale them in the dataset")
+    if largest > MAX_FLOAT32:
+        raise OffbenchError(
+            f"{what} reach {largest:.3g}, beyond float32's {MAX_FLOAT32:.2g}; scale them in the dataset"
+        )
     return np.asarray(array, np.float32)
 
 

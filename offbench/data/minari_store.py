@@ -17,12 +17,12 @@ from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
 from offbench.common.files import (
     LOCK_TIMEOUT,
     JsonObject,
-    damage,
     delete,
-    disk_errors,
     exclusive_lock,
     home_folder,
+    read_errors,
     read_json,
+    write_errors,
 )
 from offbench.common.scores import are_references
 from offbench.common.settings import read_back, setting
@@ -198,7 +198,7 @@ def _check_fields(metadata: JsonObject) -> None:
 def exists(dataset_id: str) -> bool:
     """Return whether there is a local dataset of this id, damaged or not. Raises OffbenchError if that is unknown."""
     path = root() / dataset_id / "data" / "metadata.json"
-    with damage(str(path), "cannot be looked up", "check the id and the disk"):
+    with read_errors(str(path), "cannot be looked up", "check the id and the disk"):
         return _inside(dataset_id) and (path.exists() or (_restore_replaced(root() / dataset_id) and path.exists()))
 
 
@@ -208,7 +208,7 @@ def _inside(dataset_id: str) -> bool:
     return bool(parts) and ".." not in parts and "\0" not in dataset_id and not dataset_id.startswith((".", "/"))
 
 
-def provenance(metadata: JsonObject) -> Provenance:
+def read_provenance(metadata: JsonObject) -> Provenance:
     """Return what offbench recorded about a dataset."""
     return read_back(Provenance, metadata.get(KEY) or {}, "the metadata", "record or download the dataset again")
 
@@ -221,7 +221,7 @@ def references(metadata: JsonObject) -> tuple[float, float] | None:
 
 def check_content(dataset_id: str, metadata: JsonObject, content: str) -> None:
     """Raise OffbenchError if a dataset's content hash is not the one that its metadata record, where they do."""
-    if provenance(metadata).content_sha256 not in (None, content):
+    if read_provenance(metadata).content_sha256 not in (None, content):
         raise OffbenchError(
             f"{dataset_id} is damaged: its arrays are not those of the content_sha256 in its metadata; "
             "record or download it again"
@@ -269,7 +269,7 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
         raise OffbenchError(f"{dataset_id} leads out of {root()} by a link; choose another id")
     _check_nesting(dataset_id, path)
     with exclusive_lock(hidden_path(path, "lock"), f"{dataset_id} is being recorded"):
-        with disk_errors(str(path)):
+        with write_errors(str(path)):
             recover(path)
         if path.exists() and not overwrite:
             message = f"{dataset_id} exists already{_size(dataset_id)}"
@@ -305,7 +305,7 @@ def _tidy(path: Path, timeout: float) -> None:
     with (
         contextlib.suppress(OffbenchError),
         exclusive_lock(hidden_path(path, "lock"), path.name, timeout),
-        disk_errors(str(path)),
+        write_errors(str(path)),
     ):
         recover(path)
 
@@ -313,9 +313,9 @@ def _tidy(path: Path, timeout: float) -> None:
 def recover(path: Path) -> None:
     """Restore a replaced dataset if the new one is incomplete, else delete it; delete incomplete files."""
     old, partial = hidden_path(path, "old"), hidden_path(path, "partial")
-    with disk_errors(str(partial)):
+    with write_errors(str(partial)):
         delete(partial)
-    with disk_errors(str(old)):
+    with write_errors(str(old)):
         if not path.exists() and not old.is_symlink() and (old / "data" / "metadata.json").is_file():
             old.replace(path)
         elif os.path.lexists(old):

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, check_ownership, disk_errors, write_bytes
+from offbench.common.files import JsonObject, check_ownership, write_bytes, write_errors
 from offbench.common.hdf5_file import SafeFile, safe_file
 from offbench.data.content_hash import ContentHash
 from offbench.data.minari_store import KEY, hidden_path, recover, root
@@ -51,7 +51,7 @@ def write(
     spec = parse_spec(env_spec) if env_spec else None
     temporary = hidden_path(path, "partial")
     check_ownership(temporary)
-    with disk_errors(str(path)):
+    with write_errors(str(path)):
         (temporary / "data").mkdir(parents=True)
         try:
             with warnings.catch_warnings():
@@ -68,8 +68,8 @@ def write(
                 raise OffbenchError(
                     "the data are not those that were exported (their hash differs); export them again"
                 )
-            ours = metadata[KEY] | {"content_sha256": content.hexdigest()}
-            storage.update_metadata(metadata | {KEY: ours})
+            provenance = metadata[KEY] | {"content_sha256": content.hexdigest()}
+            storage.update_metadata(metadata | {KEY: provenance})
             with open(temporary / "data" / "metadata.json", "rb") as file:
                 os.fsync(file.fileno())
             _write_namespaces(path)

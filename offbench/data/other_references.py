@@ -18,8 +18,8 @@ def warn_other_references(recipe: Recipe, ladder: Ladder) -> None:
     others = []
     for dataset_id in minari_store.local_ids():
         with contextlib.suppress(OffbenchError):
-            ours = minari_store.provenance(minari_store.read_metadata(dataset_id))
-            if ours.env == recipe.name and _scale(ours.references) not in (None, wanted):
+            provenance = minari_store.read_provenance(minari_store.read_metadata(dataset_id))
+            if provenance.env == recipe.name and _scale(provenance.references) not in (None, wanted):
                 others.append(dataset_id)
     if others:
         warn(

@@ -51,10 +51,10 @@ def evaluation_spec(metadata: JsonObject) -> str | None:
 
 def recorded_margin(metadata: JsonObject) -> str | None:
     """Return the rule for contact margins that a dataset was recorded under; None if its metadata do not tell."""
-    ours = minari_store.provenance(metadata)
+    provenance = minari_store.read_provenance(metadata)
     recorded = "versions" in (metadata.get(minari_store.KEY) or {})  # by offbench, first with the earlier rule alone
-    if ours.contact_margin or recorded:
-        return ours.contact_margin or MAX_RULE
+    if provenance.contact_margin or recorded:
+        return provenance.contact_margin or MAX_RULE
     demands = (CLAUSE.findall(item) for item in _requirements(metadata) if re.match(r"\s*mujoco\b(?!-)", item))
     for operator, major, minor in itertools.chain.from_iterable(demands):
         version = (int(major), int(minor or 0))
@@ -72,7 +72,7 @@ def _requirements(metadata: JsonObject) -> list[str]:
 
 def recorded_mujoco(metadata: JsonObject) -> str | None:
     """Return the MuJoCo version that a dataset records, or that a requirement pins; None if unknown."""
-    if made := minari_store.provenance(metadata).versions.get("mujoco"):
+    if made := minari_store.read_provenance(metadata).versions.get("mujoco"):
         return made
     pinned = (re.fullmatch(r"mujoco\s*==\s*([\w.]+)", item) for item in _requirements(metadata))
     return next((match[1] for match in pinned if match), None)

@@ -31,7 +31,7 @@ class Summary:
 
     def lines(self) -> list[str]:
         """Return spaces, episodes, a histogram of returns and the provenance as text."""
-        ours, meta = minari_store.provenance(self.metadata), self.metadata
+        provenance, meta = minari_store.read_provenance(self.metadata), self.metadata
         lines = [
             f"{self.dataset_id}: {meta.get('description', 'no description')}",
             f"spaces          observations {space(meta, 'observation_space')}, actions {space(meta, 'action_space')}",
@@ -47,11 +47,13 @@ class Summary:
             lines.append(f"references      random {low:.1f}, expert {high:.1f}: normalized mean return {score:.1f}")
         lines += ["", *_histogram(self.returns), ""]
         lines.append("provenance")
-        for part in ours.parts or ():
+        for part in provenance.parts or ():
             lines += ["part", *(f"  {key:<13} {format_value(value)}" for key, value in part.items())]
-        origin = {name: getattr(ours, name) for name in ("env", "level", "seed", "content_sha256", "recipe_sha256")}
-        origin["imported from"] = ours.imported.get("file")
-        origin["versions"] = ", ".join(f"{name} {version}" for name, version in ours.versions.items()) or None
+        origin = {
+            name: getattr(provenance, name) for name in ("env", "level", "seed", "content_sha256", "recipe_sha256")
+        }
+        origin["imported from"] = provenance.imported.get("file")
+        origin["versions"] = ", ".join(f"{name} {version}" for name, version in provenance.versions.items()) or None
         shown = [f"{key:<15} {format_value(value)}" for key, value in origin.items() if value is not None]
         lines += shown or ["not recorded by offbench"]
         return [" ".join(line.splitlines()) for line in lines]  # a line break in a text would begin a line of its own

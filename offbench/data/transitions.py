@@ -28,13 +28,13 @@ from offbench.common.arrays import Array
 from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import (
     JsonObject,
-    damage,
     delete,
-    disk_errors,
     home_folder,
+    read_errors,
     read_json,
     read_text,
     remove_leftovers,
+    write_errors,
     write_json,
 )
 from offbench.common.progress import Progress
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 ARRAYS = ("observations", "rows", "actions", "rewards", "masks", "ends", "returns")
 ATTEMPTS = 3  # attempts to read a dataset that is being replaced
 NUMBERS = ("observations", "actions", "rewards")
-LEAST_USED_RANGE = 1e-3  # share of the range between the action bounds that actions should use
+MIN_ACTION_RANGE = 1e-3  # share of the range between the action bounds that actions should use
 CLIP_TOLERANCE = 1e-5  # actions out of bounds by more than rounding cause a warning
 
 
@@ -153,7 +153,7 @@ def load(dataset_id: str) -> Transitions:
 
 def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     metadata = minari_store.read_metadata(dataset_id)
-    expected = minari_store.provenance(metadata).content_sha256
+    expected = minari_store.read_provenance(metadata).content_sha256
     data = open_unchecked(dataset_id)
     observation_space = box(data.observation_space, f"{dataset_id}: observations")
     action_space = action_box(data.action_space, f"{dataset_id}: actions")
@@ -161,7 +161,7 @@ def _load(dataset_id: str, stamps: Stamps) -> Transitions:
     sources = {f"data/{name}": minari_store.path_of(dataset_id) / "data" / name for name in stamps}
     cached = _read_converted(folder, sources)
     if cached is None:
-        with disk_errors(str(folder), "set OFFBENCH_CACHE to another folder"):
+        with write_errors(str(folder), "set OFFBENCH_CACHE to another folder"):
             folder.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(folder.with_name(f"{folder.name}.lock")):
                 cached = _read_converted(folder, sources)  # another process may have converted it meanwhile
@@ -186,7 +186,7 @@ def _read_converted(folder: Path, sources: Mapping[str, Path]) -> tuple[str, dic
         OffbenchError: it cannot be read for another reason, such as its permissions.
     """
     try:
-        with damage(str(folder), "is damaged", "it is converted again"):
+        with read_errors(str(folder), "is damaged", "it is converted again"):
             meta = json.loads(read_text(folder / "meta.json"))
             paths = {**sources, **{f"{name}.npy": folder / f"{name}.npy" for name in ARRAYS}}
             files = check_files(paths, meta["files"])
@@ -319,7 +319,7 @@ def _scaled(actions: Array, space: gym.spaces.Box, dataset_id: str) -> Array:
     outside = int((np.abs(scaled) > 1 + CLIP_TOLERANCE).any(1).sum())
     if outside:
         warn(f"{dataset_id}: {outside} actions out of bounds were clipped")
-    if 0 < (used := float((scaled.max(0) - scaled.min(0)).max()) / 2) < LEAST_USED_RANGE:
+    if 0 < (used := float((scaled.max(0) - scaled.min(0)).max()) / 2) < MIN_ACTION_RANGE:
         warn(
             f"{dataset_id}: actions use {used:.1g} of the range between the action space's bounds, "
             "which policies can hardly resolve; correct the action space to what the environment takes"

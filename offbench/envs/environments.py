@@ -31,9 +31,9 @@ Env: TypeAlias = gym.Env[Array, Array]
 Space: TypeAlias = gym.Space[Any]
 PASSIVE_WRAPPERS = {"OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics"}  # wrappers that change nothing
 RENDERING_ARGUMENTS = {"render_mode", "width", "height", "camera_id", "camera_name", "default_camera_config"}
-LARGEST_BOUND = 1e6  # largest action bound; larger ones, such as float32's maximum, count as unbounded
-LONGEST_EPISODE = 20_000  # steps that an episode may take in an environment without a time limit
-LARGEST_LIMIT = 1_000_000  # a larger time limit counts as none
+MAX_ACTION_BOUND = 1e6  # larger bounds, such as float32's maximum, count as none
+MAX_EPISODE_STEPS = 20_000  # steps that an episode may take in an environment without a time limit
+MAX_TIME_LIMIT = 1_000_000  # a larger time limit counts as none
 OTHER_ENV = "give the right environment with --env RECIPE"
 
 
@@ -66,8 +66,8 @@ def parse_spec(text: str) -> EnvSpec:
     return EnvSpec.from_json(without_margin(text)[0])
 
 
-def checked_spec(text: str, where: str, observation_dim: int, low: Array, high: Array) -> str:
-    """Return the EnvSpec JSON that a file carries if it can be trusted, made, and has the file's shapes.
+def check_spec(text: str, where: str, observation_dim: int, low: Array, high: Array) -> None:
+    """Check that the EnvSpec JSON of a file can be trusted and made, and has the file's shapes.
 
     Warns on stderr if the environment takes actions within other bounds than `low` and `high`, [act] each, or may
     never end.
@@ -95,7 +95,6 @@ def checked_spec(text: str, where: str, observation_dim: int, low: Array, high: 
             f"{where} has actions with bounds {_bounds(low, high)}, the environment {name} takes "
             f"{_bounds(actions.low, actions.high)}: returns in it are not those of the data's task"
         )
-    return text
 
 
 def same_bounds(space: gym.spaces.Box, low: Array, high: Array) -> bool:
@@ -155,7 +154,7 @@ def time_limit(spec: EnvSpec | None) -> int | None:
     limit = spec.max_episode_steps if spec else None
     for wrapper in spec.additional_wrappers if spec else ():
         limit = (wrapper.kwargs or {}).get("max_episode_steps", limit) if wrapper.name == "TimeLimit" else limit
-    return limit if isinstance(limit, int) and 0 < limit <= LARGEST_LIMIT else None
+    return limit if isinstance(limit, int) and 0 < limit <= MAX_TIME_LIMIT else None
 
 
 def _warn_no_time_limit(name: str, spec: EnvSpec | None) -> None:
@@ -164,7 +163,7 @@ def _warn_no_time_limit(name: str, spec: EnvSpec | None) -> None:
         _warned_no_time_limit.add(name)
         warn(
             f"{name} has no time limit (max_episode_steps): an episode that does not end within "
-            f"{LONGEST_EPISODE:,} steps is an error"
+            f"{MAX_EPISODE_STEPS:,} steps is an error"
         )
 
 
@@ -183,7 +182,7 @@ def make_env(env_spec: str, render_mode: str | None = None) -> Env:
         from offbench.envs.contact_margins import model_of, set_contacts  # imports MuJoCo, which is slow to load
 
         if (model := model_of(env)) is not None:
-            set_contacts(model, rule, made.id)
+            set_contacts(model, rule, spec.id)
     _cache_health(env.unwrapped)
     return env
 
@@ -303,7 +302,7 @@ def box(space: Space, what: str) -> gym.spaces.Box:
     return space
 
 
-LARGEST_FLAT = 1_000_000  # dimensions
+MAX_FLAT_SIZE = 1_000_000  # dimensions
 
 
 def _flattening(space: Space, what: str) -> str:
@@ -311,7 +310,7 @@ def _flattening(space: Space, what: str) -> str:
     if "observation" not in what:
         return "offbench's algorithms choose continuous actions, one number for each dimension"
     try:
-        flat: Space = gym.spaces.flatten_space(space) if gym.spaces.flatdim(space) < LARGEST_FLAT else space
+        flat: Space = gym.spaces.flatten_space(space) if gym.spaces.flatdim(space) < MAX_FLAT_SIZE else space
     except (NotImplementedError, ValueError):
         flat = space
     if not isinstance(flat, gym.spaces.Box):
@@ -326,10 +325,10 @@ def action_box(space: Space, what: str) -> gym.spaces.Box:
     if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
         raise OffbenchError(f"{what} must be bounded to be scaled, not {actions}")
     largest = max(np.abs(actions.low).max(), np.abs(actions.high).max())
-    if largest > LARGEST_BOUND:
+    if largest > MAX_ACTION_BOUND:
         raise OffbenchError(
-            f"{what} must be bounded to be scaled; a bound of {largest:.3g} is none (at most {LARGEST_BOUND:,.0f}): "
-            "correct the action space to what the environment takes"
+            f"{what} must be bounded to be scaled; a bound of {largest:.3g} is none (at most "
+            f"{MAX_ACTION_BOUND:,.0f}): correct the action space to what the environment takes"
         )
     if not (actions.low < actions.high).all():
         raise OffbenchError(

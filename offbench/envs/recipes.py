@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from offbench.common.errors import OffbenchError, unknown
-from offbench.common.files import damage, read_text
+from offbench.common.files import read_errors, read_text
 from offbench.common.scores import are_references
 from offbench.common.settings import build, setting, short_repr
 from offbench.envs.environments import PASSIVE_WRAPPERS, RENDERING_ARGUMENTS, env_spec
@@ -133,7 +133,7 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
     """Read one recipe file. `folder` is where its behaviour weights are shipped, if they are."""
     where = str(path) if folder is None else f"recipe of {folder.name}"
     try:
-        with damage(where, "is not a readable TOML file", "correct it, or name another"):
+        with read_errors(where, "is not a readable TOML file", "correct it, or name another"):
             values = tomllib.loads(read_text(path))
     except FileNotFoundError:
         raise OffbenchError(f"no recipe file {path}; write one, or name a shipped one: {', '.join(names())}") from None

@@ -52,11 +52,11 @@ WRAPPERS = {
     "TimeLimit",
 }
 ENTRY_POINT = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)", re.ASCII)
-LARGEST_ARGUMENT = 10_000  # whole number among arguments: frame_skip = 2e9 would never return
+MAX_ARGUMENT = 10_000  # whole number among arguments: frame_skip = 2e9 would never return
 MULTIPLYING = ("frame_skip", "num_repeats", "skip", "stack_size", "delay")  # arguments whose effects multiply
-MOST_VALUES = 10_000  # values in all arguments together
+MAX_ARGUMENT_VALUES = 10_000  # values in all arguments together
 DEEPEST_NESTING = 10
-LONGEST_TEXT = 200  # characters of a text
+MAX_TEXT_LENGTH = 200  # characters of a text
 
 
 @contextlib.contextmanager
@@ -90,16 +90,18 @@ def check_code(spec: EnvSpec) -> None:
         for name, kwargs in ((spec.id, spec.kwargs), *((w.name, w.kwargs or {}) for w in spec.additional_wrappers)):
             checker.check(kwargs, f"the arguments of {name}")
             times *= math.prod(max(1, kwargs[key]) for key in MULTIPLYING if isinstance(kwargs.get(key), int))
-        if times > LARGEST_ARGUMENT:
+        if times > MAX_ARGUMENT:
             raise OffbenchError(
-                f"it would repeat or stack {times:,} steps, and {LARGEST_ARGUMENT:,} are allowed; {REMEDY}"
+                f"it would repeat or stack {times:,} steps, and {MAX_ARGUMENT:,} are allowed; {REMEDY}"
             )
 
 
 def _check_class(entry_point: object, base: type) -> None:
     names = ENTRY_POINT.fullmatch(str(entry_point))
     if names is None:
-        raise OffbenchError(f"its entry point {str(entry_point)[:LONGEST_TEXT]!r} does not have the form module:Class")
+        raise OffbenchError(
+            f"its entry point {str(entry_point)[:MAX_TEXT_LENGTH]!r} does not have the form module:Class"
+        )
     if not (is_trusting() or _is_allowed(names[1], names[2], base)):
         kind = "environments" if base is gym.Env else "wrappers"
         raise OffbenchError(
@@ -149,7 +151,7 @@ class _ArgumentChecker:
 
     def check(self, value: object, where: str, depth: int = 0) -> None:
         self.count += 1
-        if self.count > MOST_VALUES or depth > DEEPEST_NESTING:
+        if self.count > MAX_ARGUMENT_VALUES or depth > DEEPEST_NESTING:
             raise OffbenchError(f"{where} are too many or too deeply nested; {REMEDY}")
         if isinstance(value, dict):
             for key, item in value.items():
@@ -159,12 +161,12 @@ class _ArgumentChecker:
             for item in value:
                 self.check(item, where, depth + 1)
         elif isinstance(value, str):
-            if len(value) > LONGEST_TEXT or re.search(r"[/\\\0]", value) or value.startswith((".", "~")):
-                raise OffbenchError(f"{where} hold {value[:LONGEST_TEXT]!r}, which may lead to a file; {REMEDY}")
+            if len(value) > MAX_TEXT_LENGTH or re.search(r"[/\\\0]", value) or value.startswith((".", "~")):
+                raise OffbenchError(f"{where} hold {value[:MAX_TEXT_LENGTH]!r}, which may lead to a file; {REMEDY}")
         elif isinstance(value, int):
-            if abs(value) > LARGEST_ARGUMENT:
+            if abs(value) > MAX_ARGUMENT:
                 raise OffbenchError(
-                    f"{where} hold {str(value)[:20]}, and whole numbers may be {LARGEST_ARGUMENT:,} at most; {REMEDY}"
+                    f"{where} hold {str(value)[:20]}, and whole numbers may be {MAX_ARGUMENT:,} at most; {REMEDY}"
                 )
         elif not isinstance(value, float | None):
             raise OffbenchError(f"{where} hold a {type(value).__name__}; {REMEDY}")

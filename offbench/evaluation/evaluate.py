@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from offbench.agents.ladder import shipped_references
-from offbench.common.code_hash import changes
+from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import default_workers
 from offbench.common.scores import interval, mean_std, normalize
@@ -18,7 +18,7 @@ from offbench.common.seeds import Purpose, check_seed
 from offbench.common.terminal import warn
 from offbench.common.text import counted
 from offbench.envs.environment_code import environment_code
-from offbench.envs.environments import checked_spec, env_spec, same_environment
+from offbench.envs.environments import check_spec, env_spec, same_environment
 from offbench.envs.margin_rule import MUJOCO_VERSIONS, SUM_RULE, without_margin
 from offbench.envs.recipes import d4rl_reference, load_recipe
 from offbench.envs.trust import REMEDY, is_trusting
@@ -133,14 +133,14 @@ def open_policy(path: Path, env: str | Path | None = None) -> tuple[Policy, RunC
         config = Run(path).config()
     policy = load_policy(path)
     if env is not None:
-        text = load_recipe(env).env_spec()
+        spec = load_recipe(env).env_spec()
     elif config is not None and config.env_spec is not None:
-        text = config.env_spec
+        spec = config.env_spec
     elif policy.env_id:
-        text = env_spec(_registered(policy.env_id, path))
+        spec = env_spec(_registered(policy.env_id, path))
     else:
         raise OffbenchError(f"{path} names no environment; give one with --env")
-    spec = checked_spec(text, str(path), len(policy.observation_mean), policy.low, policy.high)
-    if env is None and config and (changed := changes(config.env_code, environment_code(spec))):
+    check_spec(spec, str(path), len(policy.observation_mean), policy.low, policy.high)
+    if env is None and config and (changed := describe_changes(config.env_code, environment_code(spec))):
         warn(f"the code of {path}'s environment has changed since it was trained: {changed}")
     return policy, config, spec

@@ -18,7 +18,7 @@ import numpy as np
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import read_json, write_json
-from offbench.common.scores import LARGEST_VALUE
+from offbench.common.scores import MAX_VALUE
 from offbench.common.seeds import Purpose, check_seed, generator
 from offbench.common.settings import read_back
 from offbench.training.run import Run
@@ -50,7 +50,7 @@ class Similarity:
         percents, tolerances = (self.q_similar, self.action_similar), (self.tolerance, self.action_tolerance)
         if self.step < 0 or self.samples < 1 or not all(0 <= percent <= 100 for percent in percents):
             raise OffbenchError("step, samples or a percentage is out of range")
-        if not all(0 <= tolerance < LARGEST_VALUE for tolerance in tolerances):
+        if not all(0 <= tolerance < MAX_VALUE for tolerance in tolerances):
             raise OffbenchError("a tolerance is out of range")
 
 

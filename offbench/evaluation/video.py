@@ -21,7 +21,7 @@ import numpy as np
 from offbench.agents.ladder import BEHAVIOUR, find_ladder
 from offbench.common import seeds
 from offbench.common.errors import OffbenchError
-from offbench.common.files import disk_errors, output_file, write_bytes
+from offbench.common.files import output_file, write_bytes, write_errors
 from offbench.common.seeds import Purpose, check_seed
 from offbench.data.levels import parse_level
 from offbench.envs.environments import Env, make_env, spaces_of, time_limit
@@ -209,7 +209,7 @@ def _encoder() -> Callable[[Path, Iterator[Image], float], None]:
 
     def mp4(path: Path, frames: Iterator[Image], fps: float) -> None:
         temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
-        with disk_errors(str(path)):
+        with write_errors(str(path)):
             try:
                 first = next(frames)
                 writer = imageio_ffmpeg.write_frames(

@@ -42,7 +42,7 @@ def dataset_table(results: Results) -> Table:
 def _sizes(task: Task) -> list[Cell]:
     """Return transitions, episodes and mean return of a dataset if it is here with the same content."""
     try:
-        recorded = minari_store.provenance(minari_store.read_metadata(task.dataset)).content_sha256
+        recorded = minari_store.read_provenance(minari_store.read_metadata(task.dataset)).content_sha256
         if recorded not in (None, task.content_sha256):
             return [EMPTY] * 3  # recorded again since: not worth a conversion
         data = transitions.load(task.dataset)

@@ -21,7 +21,7 @@ from offbench.analysis.results import REFERENCES, Entry, Results, Task, read_res
 from offbench.analysis.statistics import Estimate, curve, iqm, profile
 from offbench.common.arrays import Array
 from offbench.common.plotting import figure, picture_file, save
-from offbench.common.scores import LARGEST_VALUE, SCORED_EVALUATIONS
+from offbench.common.scores import MAX_VALUE, SCORED_EVALUATIONS
 from offbench.common.text import compact, printable
 from offbench.reports.tables import Aggregates
 
@@ -243,7 +243,7 @@ def _column(entry: Entry, column: str) -> tuple[list[int], Array] | None:
         return None
     values = np.array([[run[step] for step in steps] for run in series])
     # a diverging run may exceed what an axis can show
-    return steps, np.where(np.abs(values) < LARGEST_VALUE, values, np.nan)
+    return steps, np.where(np.abs(values) < MAX_VALUE, values, np.nan)
 
 
 def _band(axes: Axes, x: Sequence[float], points: Sequence[Estimate], style: LineStyle) -> None:

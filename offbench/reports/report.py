@@ -17,7 +17,7 @@ from pathlib import Path
 
 from offbench.analysis.results import Folders, Results, read_results
 from offbench.common.errors import OffbenchError
-from offbench.common.files import damage, read_bytes, write_together
+from offbench.common.files import read_bytes, read_errors, write_together
 from offbench.common.tables import Table, files
 from offbench.common.text import counted, from_to, plural
 from offbench.reports import figures, tables
@@ -86,7 +86,7 @@ def _earlier_files(folder: Path) -> set[Path]:
         raise OffbenchError(f"{folder} is a file; give another --out")
     page = folder / PAGE
     try:
-        with damage(str(page), "is not a report of offbench", "give another --out"):
+        with read_errors(str(page), "is not a report of offbench", "give another --out"):
             if GENERATOR.encode() not in read_bytes(page):
                 raise ValueError("it lacks the generator tag of offbench")
     except FileNotFoundError:

@@ -30,7 +30,7 @@ from safetensors.numpy import load, save
 
 from offbench.common.arrays import Array, content_sha256
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, damage, read_bytes, write_bytes
+from offbench.common.files import JsonObject, read_bytes, read_errors, write_bytes
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -44,8 +44,8 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {  # they work in place
     "tanh": lambda x: np.tanh(x, out=x),
 }
 NETWORKS = ("layers", "critic")
-MOST_SAMPLES = 10_000  # actions to choose from; more would fill the memory
-MOST_VALUES = 4_000_000  # samples times the width of the critic
+MAX_SAMPLES = 10_000  # actions to choose from; more would fill the memory
+MAX_CRITIC_VALUES = 4_000_000  # samples times the width of the critic
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # Stable-Baselines3's bounds, and CQL's
 
 
@@ -233,7 +233,7 @@ def uniform(low: Array, high: Array, observation_dim: int, env_id: str) -> Polic
 def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Read a policy file. Raises OffbenchError if it is not one, or is damaged."""
     try:
-        with damage(str(path), "is not a readable policy file", "give another, or write it again"):
+        with read_errors(str(path), "is not a readable policy file", "give another, or write it again"):
             return from_bytes(read_bytes(Path(path)))
     except FileNotFoundError:
         raise OffbenchError(f"no run or policy file {path}") from None
@@ -299,15 +299,15 @@ def check_networks(parts: Policy | PolicyParts, observations: int, actions: int)
         raise ValueError(f"unknown kind {parts.kind!r}; the kinds are {', '.join(KINDS)}")
     if not isinstance(parts.activation, str) or parts.activation not in ACTIVATIONS:
         raise ValueError(f"unknown activation {parts.activation!r}; the activations are {', '.join(ACTIVATIONS)}")
-    if not isinstance(parts.samples, int) or not 1 <= parts.samples <= MOST_SAMPLES:
-        raise ValueError(f"samples must be a whole number from 1 to {MOST_SAMPLES}, not {parts.samples!r}")
+    if not isinstance(parts.samples, int) or not 1 <= parts.samples <= MAX_SAMPLES:
+        raise ValueError(f"samples must be a whole number from 1 to {MAX_SAMPLES}, not {parts.samples!r}")
     if parts.kind == "uniform":
         return
     _check_layers(parts.layers, observations, actions * (1 if parts.kind == "tanh" else 2))
     if parts.kind == "best_by_q":
         _check_layers(parts.critic, observations + actions, 1)
         widest = max(len(bias) for _, bias in parts.critic)
-        if parts.samples * widest > MOST_VALUES:
+        if parts.samples * widest > MAX_CRITIC_VALUES:
             raise ValueError(f"{parts.samples} samples for a critic of width {widest} would fill the memory")
 
 

@@ -30,7 +30,7 @@ from offbench.common.errors import SHOW_TRACEBACK, OffbenchError
 from offbench.common.processes import closing, start_errors, start_worker, uninterrupted_start
 from offbench.common.scores import interval
 from offbench.common.seeds import Purpose
-from offbench.envs.environments import LONGEST_EPISODE, Env, box, make_env, reason, time_limit
+from offbench.envs.environments import MAX_EPISODE_STEPS, Env, box, make_env, reason, time_limit
 from offbench.rollouts.function_policy import FunctionPolicy
 from offbench.rollouts.policy import Policy, from_bytes
 
@@ -119,7 +119,7 @@ class _RunningEpisode:
         self.seed = seeds.integer(task.seed, Purpose.RESET, *task.stream, index)
         self.rng = seeds.generator(task.seed, Purpose.ACTION, *task.stream, index)
         self.space = box(env.action_space, "actions")
-        self.limit = time_limit(env.spec) or LONGEST_EPISODE
+        self.limit = time_limit(env.spec) or MAX_EPISODE_STEPS
         self.observations = [reset(env, self.seed)]
         self.actions: list[Array] = []
         self.rewards: list[float] = []

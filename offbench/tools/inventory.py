@@ -68,7 +68,7 @@ def _datasets() -> JsonObject:
         except (OffbenchError, KeyError, TypeError, ValueError):
             warn(f"{dataset_id} has damaged metadata")
             continue
-        full = minari_store.provenance(metadata).full_size
+        full = minari_store.read_provenance(metadata).full_size
         short = full is not None and counts["total_steps"] < full
         more = {"algorithm_name": metadata.get("algorithm_name"), "short_of": full if short else None}
         datasets[dataset_id] = counts | more

@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from offbench.common.code_hash import changes
+from offbench.common.code_hash import describe_changes
 from offbench.common.terminal import inform, warn
 from offbench.data import transitions
-from offbench.data.minari_store import provenance
+from offbench.data.minari_store import read_provenance
 from offbench.data.recorded_env import report_margin_rule
 from offbench.data.transitions import Transitions
 from offbench.envs.environment_code import environment_code
-from offbench.envs.environments import checked_spec
+from offbench.envs.environments import check_spec
 from offbench.envs.version_warning import warn_other_physics
 from offbench.training.spec import RunSpec
 
@@ -36,11 +36,11 @@ def check_datasets(datasets: Datasets) -> None:
     """
     for name, data in datasets.items():
         if data.env_spec:
-            checked_spec(data.env_spec, name, data.observations.shape[1], data.low, data.high)
-            recorded = provenance(data.metadata)
+            check_spec(data.env_spec, name, data.observations.shape[1], data.low, data.high)
+            recorded = read_provenance(data.metadata)
             if data.evaluated_in is None:
                 report_margin_rule(name, data.metadata, data.env_spec)
-                if changed := changes(recorded.env_code, environment_code(data.env_spec)):
+                if changed := describe_changes(recorded.env_code, environment_code(data.env_spec)):
                     warn(f"{name} was recorded in other code of its environment: {changed}; scores may not compare")
             warn_other_physics(name, recorded.versions, data.env_spec)
         else:

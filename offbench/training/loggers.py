@@ -18,7 +18,7 @@ from types import TracebackType
 import numpy as np
 
 from offbench.common.errors import OffbenchError
-from offbench.common.files import disk_errors, read_json, write_json
+from offbench.common.files import read_json, write_errors, write_json
 from offbench.common.scores import Evaluations, normalize
 from offbench.common.settings import read_back
 from offbench.training.run import Run
@@ -83,7 +83,7 @@ class TensorBoard:
         from torch.utils.tensorboard import SummaryWriter
 
         folder = _folder(run, "tensorboard")
-        with disk_errors(str(folder)):
+        with write_errors(str(folder)):
             # those of an earlier session may hold steps after the checkpoint that this one resumes from
             for old in folder.glob("events.out.tfevents.*"):
                 old.unlink()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from offbench.common import checkpoints
-from offbench.common.code_hash import changes
+from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError
 from offbench.common.settings import build
 from offbench.data import transitions
@@ -34,7 +34,7 @@ def restore(run: Run, algorithm: str | type | None = None) -> Stack:
             raise
         raise OffbenchError(f"{error}; for a file of your own, give --algorithm ./FILE.py:CLASS") from None
     recorded = current_settings(config.algorithm, config.settings, str(run.folder))
-    if changed := changes(config.code, code_of(config.algorithm)):
+    if changed := describe_changes(config.code, code_of(config.algorithm)):
         raise OffbenchError(
             f"{run.folder} was trained by other code of {config.algorithm}: {changed}; restore that code, or train the"
             " run again"

@@ -20,21 +20,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from offbench.common.code_hash import changes
+from offbench.common.code_hash import describe_changes
 from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import (
     csv_bytes,
-    damage,
     delete,
     exclusive_lock,
     open_regular,
+    read_errors,
     read_json,
     remove_leftovers,
     write_bytes,
     write_json,
 )
 from offbench.common.provenance import TrainingPlatform
-from offbench.common.scores import LARGEST_VALUE, Evaluations, check_steps
+from offbench.common.scores import MAX_VALUE, Evaluations, check_steps
 from offbench.common.settings import read_back
 from offbench.training.former_settings import current_settings
 from offbench.training.run_config import FORMAT, RunConfig, Session
@@ -165,10 +165,10 @@ class Run:
                 flag = f"--{key.replace('_', '-')}"
                 return f"{self.folder} was started with {flag} {old}, not {new} (to continue it, give {flag} {old})"
             return f"{self.folder} was started with {key} {old}, not {new}"
-        changed = changes(existing.code, config.code)
+        changed = describe_changes(existing.code, config.code)
         if changed:
             return f"{self.folder} was trained by other code of {config.algorithm}: {changed}"
-        changed = changes(existing.env_code, config.env_code)
+        changed = describe_changes(existing.env_code, config.env_code)
         return f"{self.folder} was evaluated in other code of its environment: {changed}" if changed else ""
 
     def clear(self) -> None:
@@ -233,9 +233,9 @@ class Run:
                 raise DamagedError(f"{self.evaluations_path} is missing; put it back, or delete the run to repeat it")
             return {}
         config = self.config() if self.config_path.exists() else None
-        last, count = (config.steps, config.eval_episodes) if config else (LARGEST_VALUE, 0)
+        last, count = (config.steps, config.eval_episodes) if config else (MAX_VALUE, 0)
         evaluations: dict[int, list[tuple[float, int]]] = {}
-        with damage(str(self.evaluations_path), "is damaged", DELETE_TO_REPEAT):
+        with read_errors(str(self.evaluations_path), "is damaged", DELETE_TO_REPEAT):
             with open(self.evaluations_path, newline="", encoding="utf-8", opener=open_regular) as file:
                 reader = csv.DictReader(file, strict=True)
                 if tuple(reader.fieldnames or ()) != EVALUATION_COLUMNS:
@@ -244,7 +244,7 @@ class Run:
                     if None in row or None in row.values():
                         raise ValueError(f"line {reader.line_num} does not have {len(EVALUATION_COLUMNS)} cells")
                     value, step = _number(row["return"]), _count(row["step"])
-                    if not abs(value) < LARGEST_VALUE:
+                    if not abs(value) < MAX_VALUE:
                         raise ValueError(f"a return is {value}")
                     if not 0 < step <= last:
                         raise ValueError(f"step {step} of a run of {last} steps")
@@ -281,12 +281,12 @@ class Run:
         if not path.exists():
             return []
         with (
-            damage(str(path), "is damaged", DELETE_TO_REPEAT),
+            read_errors(str(path), "is damaged", DELETE_TO_REPEAT),
             open(path, newline="", encoding="utf-8", opener=open_regular) as file,
         ):
             rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
             steps = [row["step"] for row in rows if "step" in row]
-            if not all(low < high for low, high in itertools.pairwise([-1.0, *steps, LARGEST_VALUE])):
+            if not all(low < high for low, high in itertools.pairwise([-1.0, *steps, MAX_VALUE])):
                 raise ValueError("its steps are out of order or out of range")
             return rows
 

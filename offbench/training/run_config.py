@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
 from offbench.common.provenance import Hardware
-from offbench.common.scores import LARGEST_VALUE, are_references
+from offbench.common.scores import MAX_VALUE, are_references
 
 FORMAT = "offbench-run-1"
 
@@ -73,7 +73,7 @@ class RunConfig:
         for name in ("algorithm", "variant", "dataset", "label"):
             if len(getattr(self, name).splitlines()) > 1:
                 raise OffbenchError(f"{name} has several lines, which would be rows of their own in tables")
-        if self.seed < 0 or not 0 <= self.steps < LARGEST_VALUE:
+        if self.seed < 0 or not 0 <= self.steps < MAX_VALUE:
             raise OffbenchError(f"seed {self.seed} or steps {self.steps} is out of range")
         if self.env_spec is not None:
             try:

@@ -18,7 +18,7 @@ import numpy as np
 
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
-from offbench.common.files import JsonObject, check_ownership, disk_errors, read_bytes
+from offbench.common.files import JsonObject, check_ownership, read_bytes, write_errors
 from offbench.common.interrupts import collect_stop_signals
 from offbench.common.provenance import training_platform
 from offbench.common.scores import normalize
@@ -185,7 +185,7 @@ class Trainer:
         tensors = {name: tensor.detach().cpu() for name, tensor in self.stack.tensors().items()}
         for i, run in self._active():
             self._check_config(i)
-            with disk_errors(str(run.folder)):
+            with write_errors(str(run.folder)):
                 run.write_evaluations(self.evaluations[i])
                 run.write_losses(self.losses[i])
                 self.stack.policy(i).save(run.policy_path)

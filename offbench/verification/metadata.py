@@ -21,27 +21,27 @@ SLACK = 0.02  # additional tolerance, as a share of the references' distance: ru
 
 
 def check_recorded_metadata(
-    ours: Provenance, scanned: ScanResult, limit: int | None, report: Report, findings: Findings
+    provenance: Provenance, scanned: ScanResult, limit: int | None, report: Report, findings: Findings
 ) -> list[int]:
     """Check what offbench recorded about a dataset; return the last episode of each part."""
     last = [len(scanned.lengths) - 1] if scanned.lengths else []
-    if ours.content_sha256 is not None:
+    if provenance.content_sha256 is not None:
         report.checked.append("the content hash")
-        if ours.content_sha256 != scanned.content.hexdigest():
-            findings.add("content-hash", "metadata", f"recorded {ours.content_sha256[:12]}...")
+        if provenance.content_sha256 != scanned.content.hexdigest():
+            findings.add("content-hash", "metadata", f"recorded {provenance.content_sha256[:12]}...")
     else:
         report.skipped.append("the content hash: none is recorded")
-    if ours.parts is None:
+    if provenance.parts is None:
         report.skipped.append("levels and returns: not recorded by offbench")
         return last
     try:
-        if ours.seed is None or ours.level is None:
+        if provenance.seed is None or provenance.level is None:
             raise ValueError("no seed or no level is recorded")
-        ranges = _part_ranges(ours.parts, scanned, findings)
+        ranges = _part_ranges(provenance.parts, scanned, findings)
         if ranges is not None:
-            _check_levels(ours, ours.parts, findings)
-            for index, (part, (first, end)) in enumerate(zip(ours.parts, ranges, strict=True)):
-                _check_part(ours, part, index, range(first, end), scanned, limit, findings)
+            _check_levels(provenance, provenance.parts, findings)
+            for index, (part, (first, end)) in enumerate(zip(provenance.parts, ranges, strict=True)):
+                _check_part(provenance, part, index, range(first, end), scanned, limit, findings)
             last = [end - 1 for _, end in ranges]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, ZeroDivisionError, OverflowError) as error:
         findings.add("metadata", "metadata", f"{type(error).__name__}: {error}")
@@ -60,21 +60,21 @@ def _part_ranges(parts: Sequence[JsonObject], scanned: ScanResult, findings: Fin
     return list(zip([0, *(last_episodes[:-1] + 1)], last_episodes + 1, strict=True))
 
 
-def _references(ours: Provenance) -> tuple[float, float]:
+def _references(provenance: Provenance) -> tuple[float, float]:
     """Return the random and the expert return; infinity for an expert that was not trained yet."""
-    references = {"expert": {"return": math.inf}} | ours.references
+    references = {"expert": {"return": math.inf}} | provenance.references
     return float(references["random"]["return"]), float(references["expert"]["return"])
 
 
-def _check_levels(ours: Provenance, parts: Sequence[JsonObject], findings: Findings) -> None:
+def _check_levels(provenance: Provenance, parts: Sequence[JsonObject], findings: Findings) -> None:
     """Check that the recorded returns and fractions of the levels agree with each other."""
-    low, high = _references(ours)
+    low, high = _references(provenance)
     returns = {part["source"]: float(part["return"]) for part in parts if "return" in part}
     order = [returns[name] for name in ("uniform", "medium", "expert") if name in returns]
     if not low < high or order != sorted(order) or returns.get("medium", low) >= high:
         findings.add("level-order", "metadata", f"random {low:g}, expert {high:g}, parts {returns}")
-    if ours.level in LEVELS and [p.source for p in LEVELS[ours.level]] != [p["source"] for p in parts]:
-        findings.add("metadata", "metadata", f"level {ours.level} is not made of these parts")
+    if provenance.level in LEVELS and [p.source for p in LEVELS[provenance.level]] != [p["source"] for p in parts]:
+        findings.add("metadata", "metadata", f"level {provenance.level} is not made of these parts")
     for part in parts:
         if "fraction" in part and abs(normalize(float(part["return"]), low, high) / 100 - part["fraction"]) > 0.01:
             findings.add(
@@ -83,7 +83,7 @@ def _check_levels(ours: Provenance, parts: Sequence[JsonObject], findings: Findi
 
 
 def _check_part(
-    ours: Provenance,
+    provenance: Provenance,
     part: JsonObject,
     index: int,
     chosen: range,
@@ -94,7 +94,7 @@ def _check_part(
     """Check one part's seeds and mean return."""
     if part["source"] != "replay":
         for k, i in enumerate(chosen):
-            if scanned.seeds[i] != seeds.integer(ours.seed or 0, Purpose.RESET, index, k):
+            if scanned.seeds[i] != seeds.integer(provenance.seed or 0, Purpose.RESET, index, k):
                 out.add("wrong-seeds", f"episode {i}")
     if "return" not in part:
         return
@@ -103,11 +103,11 @@ def _check_part(
     ]
     if not complete or not np.isfinite(complete).all():
         return
-    count = int(part.get("episodes") or ours.references["random"]["episodes"])
+    count = int(part.get("episodes") or provenance.references["random"]["episodes"])
     half = (float(part["interval"][1]) - float(part["interval"][0])) / 2 / 1.96
     # standard deviation of returns: the larger of the data's and the recorded interval's
     spread = max(float(np.std(complete, ddof=1)) if len(complete) > 1 else 0.0, half * count**0.5)
-    low, high = _references(ours)
+    low, high = _references(provenance)
     slack = SLACK * abs(high - low) if math.isfinite(high) else 0.0
     allowed = SIGMAS * (spread**2 / len(complete) + half**2) ** 0.5 + slack
     mean, recorded = float(np.mean(complete)), float(part["return"])

@@ -86,7 +86,7 @@ def _verify(dataset_id: str, episodes: int | None, workers: int | None) -> Repor
         findings.add("empty", dataset_id)
     _check_counts(metadata, dataset_id, scanned, findings)
     _check_terminations(scanned, limit, findings)
-    last = check_recorded_metadata(minari_store.provenance(metadata), scanned, limit, report, findings)
+    last = check_recorded_metadata(minari_store.read_provenance(metadata), scanned, limit, report, findings)
     chosen = _choose_episodes(scanned, limit, last, episodes)
     _replay(data, chosen, scanned, metadata, workers, report, findings)
     report.findings = findings.all()
@@ -138,7 +138,7 @@ def _replay(
     exact = made == here
     if made is not None and not exact:
         report.warnings.append(f"recorded with mujoco {made}, installed is {here}: compared within a tolerance")
-    last_unknown = minari_store.provenance(metadata).final_observations == "repeated"
+    last_unknown = minari_store.read_provenance(metadata).final_observations == "repeated"
     steps = sum(scanned.lengths[i] for i in chosen)
     names = [int(data.episode_indices[i]) for i in chosen]
     with Rollouts(spec, workers if workers > 1 and steps > FEW_STEPS else 0) as rollouts:

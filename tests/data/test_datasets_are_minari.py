@@ -100,14 +100,14 @@ def test_the_content_hash_is_over_the_arrays(medium: str) -> None:
     content = ContentHash()
     for episode in minari.load_dataset(medium).iterate_episodes():
         content.add(episode.observations, episode.actions, episode.rewards, episode.terminations, episode.truncations)
-    assert content.hexdigest() == minari_store.provenance(minari_store.read_metadata(medium)).content_sha256
+    assert content.hexdigest() == minari_store.read_provenance(minari_store.read_metadata(medium)).content_sha256
     assert content.hexdigest() == offbench.load(medium).content_sha256
 
 
 def test_medium_expert_is_medium_then_expert(tiny: tuple[str, str]) -> None:
     recipe, behaviour_dir = tiny
     name = offbench.collect(recipe, "medium-expert", behaviour_dir=behaviour_dir, workers=1, steps=800)
-    parts = minari_store.provenance(minari_store.read_metadata(name)).parts
+    parts = minari_store.read_provenance(minari_store.read_metadata(name)).parts
     assert parts is not None
     assert [(p["source"], p["transitions"]) for p in parts] == [("medium", 400), ("expert", 400)]
     first = offbench.collect(recipe, "medium", behaviour_dir=behaviour_dir, workers=1, steps=400)

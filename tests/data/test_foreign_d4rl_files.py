@@ -155,7 +155,7 @@ def test_what_a_file_says_of_its_environment(home: Path, rng: np.random.Generato
         metadata = minari_store.read_metadata(f"{name}-v0")
         assert json.loads(metadata["env_spec"])["id"] == recorded
         assert json.loads(metadata["eval_env_spec"])["id"] == "Hopper-v5"
-        ours = minari_store.provenance(metadata)
+        ours = minari_store.read_provenance(metadata)
         assert ours.d4rl == ((-20.272305, 3234.3) if env is None else None)  # 500 steps are another task
 
 

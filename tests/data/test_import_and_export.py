@@ -138,7 +138,7 @@ def test_a_v2_file_keeps_every_row_and_v1_all_but_the_timeouts(home: Path, rng: 
             import_d4rl(home / "walker2d_medium.hdf5", f"x{version}-v0", env="walker2d")
         import_d4rl(home / "walker2d_medium.hdf5", f"x{version}-v0", env="hopper")
         assert minari_store.read_metadata(f"x{version}-v0")["total_steps"] == kept
-        ours = minari_store.provenance(minari_store.read_metadata(f"x{version}-v0"))
+        ours = minari_store.read_provenance(minari_store.read_metadata(f"x{version}-v0"))
         assert ours.timeouts == ("dropped" if version == 1 else "kept")
         assert ours.final_observations == ("repeated" if version == 1 else "kept")
 
@@ -149,7 +149,7 @@ def test_the_first_environment_is_on_record(home: Path, rng: np.random.Generator
     metadata = minari_store.read_metadata("d4rl/hopper-medium-v2")
     assert json.loads(metadata["env_spec"])["id"] == "Hopper-v2"
     assert json.loads(metadata["eval_env_spec"])["id"] == "Hopper-v5"
-    ours = minari_store.provenance(metadata)
+    ours = minari_store.read_provenance(metadata)
     assert ours.d4rl == (-20.272305, 3234.3)
     assert len(ours.imported["sha256"]) == 64
     assert "ref_min_score" not in metadata  # D4RL's constants are of another environment than it is evaluated in
@@ -197,8 +197,8 @@ def test_a_dataset_comes_back_the_same(level: str, tiny: tuple[str, str], home: 
     main(["export", name, "--out", "out.hdf5"])
     main(["import-d4rl", "out.hdf5", "--id", "back-v0"])
     ours, back = minari_store.read_metadata(name), minari_store.read_metadata("back-v0")
-    assert minari_store.provenance(back).content_sha256 == minari_store.provenance(ours).content_sha256
-    assert minari_store.provenance(back).imported["file"] == "out.hdf5"
+    assert minari_store.read_provenance(back).content_sha256 == minari_store.read_provenance(ours).content_sha256
+    assert minari_store.read_provenance(back).imported["file"] == "out.hdf5"
     same = ["env_spec", "eval_env_spec", "observation_space", "action_space", "ref_min_score", "ref_max_score"]
     same += ["author", "requirements", "algorithm_name", "total_steps", "total_episodes", "num_episodes_average_score"]
     assert {key: back[key] for key in same} == {key: ours[key] for key in same}
@@ -222,8 +222,8 @@ def test_the_references_of_another_environment_are_left_out(
     assert "--env names another environment than out.hdf5 does" in capsys.readouterr().err
     metadata = minari_store.read_metadata("other-v0")
     assert not {"ref_min_score", "ref_max_score"} & metadata.keys()
-    assert minari_store.provenance(metadata).contact_margin == "sum"
-    assert not minari_store.provenance(metadata).references
+    assert minari_store.read_provenance(metadata).contact_margin == "sum"
+    assert not minari_store.read_provenance(metadata).references
 
 
 def test_npz_holds_what_offbench_trains_on(medium: str, home: Path) -> None:

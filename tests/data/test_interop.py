@@ -67,7 +67,7 @@ def test_every_block_of_the_page_runs(d3rlpy: str, home: Path) -> None:
     timeouts = int(mapped.masks[mapped.ends - 1].sum())  # d3rlpy has no observation after these, as the page says
     steps = [int(out.strip().splitlines()[-1].split()[0]) for place, out in ran if place == "d3rlpy"]
     assert steps == 2 * [len(mapped) - timeouts]
-    assert minari_store.provenance(minari_store.read_metadata("back-v0")).content_sha256 == mapped.content_sha256
+    assert minari_store.read_provenance(minari_store.read_metadata("back-v0")).content_sha256 == mapped.content_sha256
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from offbench.envs import environments
 from offbench.envs.environments import (
     action_box,
     box,
-    checked_spec,
+    check_spec,
     env_spec,
     make_env,
     same_environment,
@@ -164,10 +164,10 @@ def test_remedies_fit_what_is_wrong() -> None:
 
 def test_other_action_bounds_are_said_where_policies_are_evaluated(capsys: pytest.CaptureFixture[str]) -> None:
     spec = env_spec("InvertedPendulum-v5")
-    checked_spec(spec, "same-v0", 4, *PENDULUM)
-    checked_spec(spec, "rounded-v0", 4, PENDULUM[0] * np.float32(1 + 1e-7), PENDULUM[1].astype(np.float64))
+    check_spec(spec, "same-v0", 4, *PENDULUM)
+    check_spec(spec, "rounded-v0", 4, PENDULUM[0] * np.float32(1 + 1e-7), PENDULUM[1].astype(np.float64))
     assert capsys.readouterr().err == ""
-    checked_spec(spec, "scaled-v0", 4, PENDULUM[0] / 3, PENDULUM[1] / 3)
+    check_spec(spec, "scaled-v0", 4, PENDULUM[0] / 3, PENDULUM[1] / 3)
     assert "scaled-v0 has actions with bounds [-1, 1], the environment" in (said := capsys.readouterr().err)
     assert "InvertedPendulum-v5 takes [-3, 3]" in said
 
@@ -194,7 +194,7 @@ def test_what_cannot_be_made_again_is_not_sent_after_a_package() -> None:
     gone = EnvSpec("HalfCheetah-v2", "gymnasium.envs.mujoco.half_cheetah:HalfCheetahEnv").to_json()
     for spec, why in ((json.dumps(monitored), "the wrapper Monitor does not record"), (gone, "half_cheetah")):
         with pytest.raises(OffbenchError, match=why) as error:
-            checked_spec(spec, "x-v0", 4, *PENDULUM)
+            check_spec(spec, "x-v0", 4, *PENDULUM)
         assert "--env RECIPE" in str(error.value)
         assert "--trust" not in str(error.value)
         assert "install" not in str(error.value)
@@ -258,13 +258,13 @@ def test_an_environment_without_a_time_limit_is_named_and_does_not_run_for_ever(
     env_spec("Steps-v0")
     assert "Steps-v0 has no time limit (max_episode_steps)" in capsys.readouterr().err
     assert play(steps) == [1.0, 1.0]  # it ends by itself
-    monkeypatch.setattr("offbench.rollouts.rollouts.LONGEST_EPISODE", 200)
+    monkeypatch.setattr("offbench.rollouts.rollouts.MAX_EPISODE_STEPS", 200)
     monkeypatch.setattr(Steps, "ends", False)
     with pytest.raises(OffbenchError, match=r"not ended within 200 steps.*max_episode_steps"):
         play(steps)
     limited = json.loads(steps) | {
         "max_episode_steps": 300
-    }  # beyond LONGEST_EPISODE: the environment's own limit counts
+    }  # beyond MAX_EPISODE_STEPS: the environment's own limit counts
     assert play(json.dumps(limited)) == [300.0, 300.0]
 
 

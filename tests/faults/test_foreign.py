@@ -241,7 +241,7 @@ def test_a_dataset_deleted_while_it_is_recorded(
         assert "was moved or deleted while it was written" in refusal(words, capsys)
     assert minari_store.local_ids() == [recorded]
     main(words)
-    assert minari_store.provenance(minari_store.read_metadata(words[-1] if not overwrite else recorded)).seed == 1
+    assert minari_store.read_provenance(minari_store.read_metadata(words[-1] if not overwrite else recorded)).seed == 1
 
 
 def test_reading_a_converted_dataset_takes_no_lock(recorded: str, home: Path) -> None:

@@ -22,7 +22,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import sha256_of
 from offbench.common.seeds import Purpose, generator
 from offbench.evaluation.similarity import similarity
-from offbench.rollouts.policy import MOST_VALUES, Policy
+from offbench.rollouts.policy import MAX_CRITIC_VALUES, Policy
 from offbench.rollouts.rollouts import NOISE_BLOCK, EpisodeTask, _RunningEpisode
 from offbench.training.run import Run
 from tests.made_runs import made_run
@@ -168,6 +168,6 @@ def test_a_policy_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
     best_by_q(100, 256).save(tmp_path / "small.safetensors")
     offbench.load_policy(tmp_path / "small.safetensors")
     path = tmp_path / "large.safetensors"
-    best_by_q(10_000, MOST_VALUES // 10_000 + 1).save(path)
+    best_by_q(10_000, MAX_CRITIC_VALUES // 10_000 + 1).save(path)
     with pytest.raises(OffbenchError, match="would fill the memory"):
         offbench.load_policy(path)

@@ -103,7 +103,7 @@ def metadata(folder: Path, data: bytes) -> object:
     found = minari_store.read_metadata("fuzzed-v0")
     empty: dict[str, Any] = dict.fromkeys(Transitions.__dataclass_fields__)
     flat = Transitions(**empty | {"dataset_id": "fuzzed-v0", "metadata": found})
-    warn_other_physics("fuzzed-v0", minari_store.provenance(found).versions, load_recipe("hopper").env_spec())
+    warn_other_physics("fuzzed-v0", minari_store.read_provenance(found).versions, load_recipe("hopper").env_spec())
     summary = Summary("fuzzed-v0", found, np.arange(4.0), np.arange(1, 5), 0.5)
     return flat.env_id, flat.references, summary.lines()
 

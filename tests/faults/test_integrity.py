@@ -376,7 +376,7 @@ def test_a_broken_package_stops_nothing_else(fault: str, tmp_path: Path) -> None
 
 def test_damage_brings_no_error_of_a_parser_out() -> None:
     for error in (RecursionError(), KeyError("x"), StopIteration(), AssertionError("odd")):
-        with pytest.raises(DamagedError, match="delete it"), files.damage("a.bin", "is damaged", "delete it"):
+        with pytest.raises(DamagedError, match="delete it"), files.read_errors("a.bin", "is damaged", "delete it"):
             raise error
 
 
@@ -387,7 +387,7 @@ def test_no_memory_is_no_damage(error: Exception) -> None:
     """An absurd size in a damaged file may ask for it, but so does a sound file beside other programs."""
     with (
         pytest.raises(OffbenchError, match="close other programs") as raised,
-        files.damage("a.bin", "is bad", "delete"),
+        files.read_errors("a.bin", "is bad", "delete"),
     ):
         raise error
     assert not isinstance(raised.value, DamagedError)

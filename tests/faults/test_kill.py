@@ -82,7 +82,7 @@ def whole(name: str) -> str:
     content = ContentHash()
     for e in episodes_of(open_minari(name)):
         content.add(e.observations, e.actions, e.rewards, e.terminations, e.truncations)
-    assert content.hexdigest() == minari_store.provenance(minari_store.read_metadata(name)).content_sha256
+    assert content.hexdigest() == minari_store.read_provenance(minari_store.read_metadata(name)).content_sha256
     return content.hexdigest()
 
 

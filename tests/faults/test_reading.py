@@ -17,7 +17,7 @@ import torch
 import offbench
 from offbench.common import checkpoints
 from offbench.common.errors import DamagedError, OffbenchError
-from offbench.common.files import damage
+from offbench.common.files import read_errors
 from offbench.data import minari_store
 from offbench.data.export import export
 from offbench.training.run import Run
@@ -111,12 +111,15 @@ def test_the_operating_systems_refusals_are_no_damage(number: int, remedy: str) 
     for error in (OSError(number, os.strerror(number)), OSError(inside)):
         with (
             pytest.raises(OffbenchError, match=f"cannot read a.hdf5: .*{remedy}") as raised,
-            damage("a.hdf5", "is damaged", "x"),
+            read_errors("a.hdf5", "is damaged", "x"),
         ):
             raise error
         assert not isinstance(raised.value, DamagedError)
     for error in (OSError("truncated file: eof = 5, stored_eof = 9"), ValueError("odd"), KeyError("rewards")):
-        with pytest.raises(DamagedError, match=r"a.hdf5 is damaged \(.*\); x"), damage("a.hdf5", "is damaged", "x"):
+        with (
+            pytest.raises(DamagedError, match=r"a.hdf5 is damaged \(.*\); x"),
+            read_errors("a.hdf5", "is damaged", "x"),
+        ):
             raise error
 
 

@@ -51,14 +51,14 @@ def test_content_is_the_same_for_any_number_of_workers(tiny: tuple[str, str]) ->
         name = offbench.collect(
             recipe, "expert", steps=3000, behaviour_dir=behaviour_dir, workers=workers, dataset_id=f"w{workers}-v0"
         )
-        hashes.append(minari_store.provenance(minari_store.read_metadata(name)).content_sha256)
+        hashes.append(minari_store.read_provenance(minari_store.read_metadata(name)).content_sha256)
     assert len(set(hashes)) == 1
 
 
 def test_another_seed_gives_other_content(tiny: tuple[str, str]) -> None:
     recipe, behaviour_dir = tiny
     hashes = {
-        minari_store.provenance(
+        minari_store.read_provenance(
             minari_store.read_metadata(
                 offbench.collect(
                     recipe, "expert", seed=seed, behaviour_dir=behaviour_dir, workers=1, dataset_id=f"s{seed}-v0"

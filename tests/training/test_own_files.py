@@ -18,7 +18,7 @@ import offbench
 from offbench.analysis.results import read_results
 from offbench.cli.main import main
 from offbench.common import code_hash
-from offbench.common.code_hash import changes
+from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError
 from offbench.reports.tables import score_table
 from offbench.training import registry, source_code
@@ -237,8 +237,8 @@ def test_an_edit_of_an_imported_neighbor_is_noticed(home: Path) -> None:
     before = code_of(registry.register("awac.py"))
     again(home)
     (home / "losses.py").write_text("WEIGHT = 50\n")
-    assert changes(before, code_of(registry.register("awac.py"))) == "losses.py has changed"
-    assert changes({}, code_of(registry.register("awac.py"))) == ""  # a run of an earlier version
+    assert describe_changes(before, code_of(registry.register("awac.py"))) == "losses.py has changed"
+    assert describe_changes({}, code_of(registry.register("awac.py"))) == ""  # a run of an earlier version
 
 
 LAYOUTS = {  # how the file imports a neighbor, and the neighbor
@@ -265,7 +265,7 @@ def test_an_edit_is_noticed_however_a_neighbor_is_imported(line: str, home: Path
     assert before.keys() <= {"bc.py", "my_algo.py", "losses.py", *(f"parts/{p.name}" for p in home.glob("parts/*.py"))}
     again(home)
     (home / LAYOUTS[line]).write_text("WEIGHT = 2\n")
-    assert changes(before, code_of(registry.register("my_algo.py"))) == f"{LAYOUTS[line]} has changed"
+    assert describe_changes(before, code_of(registry.register("my_algo.py"))) == f"{LAYOUTS[line]} has changed"
 
 
 def test_files_of_a_package_that_are_no_python_of_today_are_hashed_all_the_same(home: Path) -> None:
@@ -282,7 +282,7 @@ def test_files_of_a_package_that_are_no_python_of_today_are_hashed_all_the_same(
     assert set(before) == files
     source_code._codes.clear()
     (home / "space" / "template.py").write_text("print 'goodbye {{ name }}'\n")
-    assert changes(before, code_of(registry.register(algorithm))) == "space/template.py has changed"
+    assert describe_changes(before, code_of(registry.register(algorithm))) == "space/template.py has changed"
 
 
 def test_an_edit_of_a_package_and_another_version_are_noticed(home: Path) -> None:
@@ -317,7 +317,7 @@ def test_an_edit_of_a_package_and_another_version_are_noticed(home: Path) -> Non
     }
     (package / "parts.py").write_text("X = 2\n")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mypackage\nVersion: 1.1\n")
-    assert changes(before, code()) == "mypackage/parts.py has changed, version of mypackage was 1.0, is 1.1"
+    assert describe_changes(before, code()) == "mypackage/parts.py has changed, version of mypackage was 1.0, is 1.1"
 
 
 def test_runs_of_one_script_are_known_by_the_class_alone(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import offbench
-from offbench.common.code_hash import MAIN, changes
+from offbench.common.code_hash import MAIN, describe_changes
 from offbench.common.errors import OffbenchError
 from offbench.training import registry
 from offbench.training.source_code import code_of
@@ -141,6 +141,6 @@ def test_a_scripts_class_of_an_earlier_version_has_not_changed(home: Path) -> No
     now = of_script(home, SCRIPT)
     before = {name: text for name, text in now.items() if not name.startswith(MAIN)}
     assert {"Mine", "Config", "bc.py"} == before.keys()
-    assert not changes(before, now)
-    assert changes(before | {"Mine": "0" * 64}, now) == "Mine has changed"
-    assert changes(now, of_script(home, SCRIPT, "HALF = 0.25\n")) == "__main__: parts.py has changed"
+    assert not describe_changes(before, now)
+    assert describe_changes(before | {"Mine": "0" * 64}, now) == "Mine has changed"
+    assert describe_changes(now, of_script(home, SCRIPT, "HALF = 0.25\n")) == "__main__: parts.py has changed"

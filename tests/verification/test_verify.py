@@ -136,7 +136,7 @@ def test_swapped_medium_and_expert() -> None:
 def test_swapped_halves_of_medium_expert() -> None:
     """In the metadata; then the episodes change places, seeds and all: equal parts still end where episodes end."""
     name = offbench.collect("inverted-pendulum", "medium-expert", steps=40_000, workers=1)
-    parts = minari_store.provenance(minari_store.read_metadata(name)).parts
+    parts = minari_store.read_provenance(minari_store.read_metadata(name)).parts
     change_metadata(name, parts=parts[::-1])
     assert codes(name) >= {"wrong-level", "metadata"}
     change_metadata(name, parts=parts)
