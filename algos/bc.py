@@ -1,4 +1,4 @@
-"""BC: behaviour cloning, the floor that every offline method must beat.
+"""BC: behaviour cloning, the baseline that every offline method should beat.
 
     loss = mean (pi(s) - a)^2
 

@@ -1,6 +1,6 @@
 """BDB: "Combined Constraint on Behavior Cloning and Discriminator in Offline Reinforcement Learning".
 
-TD3+BC (td3_bc.py) whose constraint is shared by beta between cloning and a GAN discriminator D:
+TD3+BC (td3_bc.py) with a constraint that beta divides between cloning and a GAN discriminator D:
 
     discriminator  loss = mean -log D(s, a) + mean -log(1 - D(s, pi(s)))                                  (eq. 16)
     actor          loss = -lambda mean Q_1(s, pi(s)) + mean [beta (-log D(s, pi(s))) + (1 - beta) (pi(s) - a)^2]

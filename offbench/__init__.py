@@ -1,4 +1,4 @@
-"""offbench: offline-RL datasets from today's Gymnasium MuJoCo tasks, and algorithms benchmarked on them.
+"""offbench: offline-RL datasets on current Gymnasium MuJoCo tasks, and benchmarks of algorithms on them.
 
     import offbench
 

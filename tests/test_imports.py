@@ -130,11 +130,11 @@ def test_rollout_workers_load_neither_pytorch_nor_the_users_script(home: Path) -
 print("script runs")
 import numpy as np
 from offbench.envs.environments import env_spec
-from offbench.rollouts.policy import uniform
+from offbench.rollouts.policy import uniform_policy
 from offbench.rollouts.rollouts import Rollouts, gather
 
 with Rollouts(env_spec("InvertedPendulum-v5"), workers=1) as rollouts:
-    policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
+    policy = uniform_policy(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     print(len(gather(rollouts.start_evaluation(policy, 0, (), 3, True))), "episodes")
     loaded = "set(__import__('sys').modules) & {'torch', 'stable_baselines3'}"
     print("worker has", list(rollouts._pool.submit(eval, loaded).result()))

@@ -40,7 +40,7 @@ from offbench.common.seeds import Purpose
 from offbench.common.terminal import inform
 from offbench.envs.environments import make_env, spaces_of
 from offbench.envs.recipes import Recipe
-from offbench.rollouts.policy import Policy, load_policy, uniform
+from offbench.rollouts.policy import Policy, read_policy_file, uniform_policy
 from offbench.rollouts.rollouts import MEASURES, EpisodeStats, Rollouts, summary
 
 EXPERT_CANDIDATES = 8  # late rungs measured to choose the expert
@@ -106,7 +106,7 @@ class RungEvaluator:
         return self.measured[step]["return"]
 
     def _play(self, step: int) -> dict[str, float]:
-        policy, count = load_policy(self.folder.policy(step)), self.folder.recipe.measure.rung_episodes
+        policy, count = read_policy_file(self.folder.policy(step)), self.folder.recipe.measure.rung_episodes
         row: dict[str, float] = {"episodes": count}
         for prefix, deterministic in (("", False), ("deterministic_", True)):
             stream = (int(Purpose.MEASURE), step, int(deterministic))
@@ -115,7 +115,7 @@ class RungEvaluator:
 
     def screen(self, step: int) -> float:
         """Return the mean return of a policy within a segment over the recipe's few screening episodes."""
-        policy, stream = load_policy(self.folder.policy(step)), (int(Purpose.RUNG), step, 0)
+        policy, stream = read_policy_file(self.folder.policy(step)), (int(Purpose.RUNG), step, 0)
         return summary(self.run(policy, stream, self.folder.recipe.sac.rung_episodes))["return"]
 
     def run(
@@ -239,7 +239,7 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
         evaluator.resume()
         references = {"random": random_reference(folder.recipe, folder.seed, rollouts)}
         expert = evaluator.expert()
-        policy = load_policy(folder.policy(expert))
+        policy = read_policy_file(folder.policy(expert))
         episode_stats = evaluator.run(policy, (int(Purpose.REFERENCE), 1), episodes)
         references["expert"] = summary(episode_stats) | {"episodes": episodes}
         worst, best = references["random"]["return"], references["expert"]["return"]
@@ -279,7 +279,7 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
 def random_reference(recipe: Recipe, seed: int, rollouts: Rollouts) -> dict[str, float]:
     """Measure the return of uniform actions over the recipe's `reference_episodes`: the reference's 0."""
     observations, actions = spaces_of(make_env(recipe.env_spec()), recipe.env_id)
-    policy = uniform(actions.low, actions.high, observations.shape[0], recipe.env_id)
+    policy = uniform_policy(actions.low, actions.high, observations.shape[0], recipe.env_id)
     episodes = recipe.measure.reference_episodes
     episode_stats = rollouts.evaluate(policy, seed, (int(Purpose.REFERENCE), 0), episodes, False)
     return summary(episode_stats) | {"episodes": episodes}
@@ -295,7 +295,7 @@ def _write(out: Path, evaluator: RungEvaluator, roles: dict[int, str], info: Jso
         (temporary / "policies").mkdir(parents=True)
         for step in roles:
             # rewritten, because policy files of earlier versions have no hash
-            load_policy(folder.policy(step)).save(temporary / "policies" / folder.policy(step).name)
+            read_policy_file(folder.policy(step)).save(temporary / "policies" / folder.policy(step).name)
         write_bytes(temporary / "ladder.csv", csv_bytes(COLUMNS, _table(evaluator, roles)))
         info["medium_replay"] = save_replay(
             temporary / "medium-replay.hdf5", replay_episodes(folder, info["levels"]["medium"])

@@ -26,9 +26,9 @@ from offbench.common.terminal import inform, warn
 from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import same_environment
 from offbench.envs.margin_rule import MAX_RULE
-from offbench.envs.recipes import Recipe, load_recipe, names
+from offbench.envs.recipes import Recipe, load_recipe, shipped_recipes
 from offbench.envs.version_warning import warn_other_physics
-from offbench.rollouts.policy import Policy, load_policy
+from offbench.rollouts.policy import Policy, read_policy_file
 
 BEHAVIOUR = Path("behaviour")  # default folder of all trainings
 MEDIUM = 1 / 3  # fraction of the expert's normalized return
@@ -126,7 +126,7 @@ class Ladder:
 
     def load(self, rung: Rung) -> Policy:
         """Read a rung's policy."""
-        return load_policy(self.folder / "policies" / rung.policy)
+        return read_policy_file(self.folder / "policies" / rung.policy)
 
     def check(self, recipe: Recipe) -> None:
         """Raise OffbenchError if the ladder is of another environment than the recipe."""
@@ -241,7 +241,7 @@ def _warn_other_recipe(ladder: Ladder, recipe: Recipe) -> None:
 
 def shipped_references(env_spec: str) -> tuple[float, float] | None:
     """Return the (random, expert) returns shipped for an environment (EnvSpec JSON); None if none are shipped."""
-    for name in names():
+    for name in shipped_recipes():
         recipe = load_recipe(name)
         # the id first: making the spec of every recipe takes a while
         if recipe.env_id != json.loads(env_spec).get("id") or not same_environment(recipe.env_spec(), env_spec):

@@ -137,7 +137,7 @@ def find_method(methods: Sequence[Method], name: str) -> Method:
     labels = ", ".join(f"'{method.label}'" for method in variants or methods)
     if not variants:
         if algorithm in algorithm_names():
-            raise OffbenchError(f"{algorithm} has no evaluated runs here; there are {labels}")
+            raise OffbenchError(f"{algorithm} has no evaluated runs here; available: {labels}")
         raise unknown("method", name, [method.label for method in methods])
     if name == algorithm:
         default = variants if len(variants) == 1 else [method for method in variants if method.variant == "default"]

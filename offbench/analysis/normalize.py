@@ -48,7 +48,7 @@ def score_runs(runs: str | Path = "runs", steps: int | None = None) -> list[Row]
     return _rows(read_results(runs, steps=steps).entries.values())
 
 
-def score_some(runs: Iterable[Run]) -> list[Row]:
+def score_rows_of(runs: Iterable[Run]) -> list[Row]:
     """Return the rows of `score_runs` for these runs alone; [] if none is evaluated."""
     return _rows(entries_of(runs)[0])
 

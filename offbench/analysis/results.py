@@ -187,7 +187,7 @@ def read_results(
         methods: only these, by their names in tables; all if empty.
 
     Raises:
-        OffbenchError: none is evaluated, one is there twice, or there is no such dataset or method. Damaged runs are
+        OffbenchError: none is evaluated, one is duplicated, or there is no such dataset or method. Damaged runs are
             named on stderr and left out.
     """
     roots = tuple(map(Path, [runs] if isinstance(runs, str | Path) else runs))
@@ -234,7 +234,7 @@ def entries_of(
         compared: whether the runs are compared, so that those on the same data must have been evaluated alike.
 
     Raises:
-        OffbenchError: one is there twice, two do not compare, none but damaged ones is evaluated, or there is no such
+        OffbenchError: one is duplicated, two are not comparable, none but damaged ones is evaluated, or there is no such
             dataset.
     """
     groups: dict[tuple[str, str, str, str], list[EvaluatedRun]] = {}
@@ -301,7 +301,7 @@ def _tasks(
 
 
 def _check_evaluated_alike(one: EvaluatedRun, other: EvaluatedRun) -> None:
-    """Refuse two runs on the same data whose returns, or scores, do not compare."""
+    """Refuse two runs on the same data whose returns or scores are not comparable."""
     a, b = one.config, other.config
     if a.env_spec and b.env_spec and not same_environment(a.env_spec, b.env_spec):
         differ = "were evaluated in different environments"
@@ -313,7 +313,7 @@ def _check_evaluated_alike(one: EvaluatedRun, other: EvaluatedRun) -> None:
         return
     raise OffbenchError(
         f"{one.files.folder} and {other.files.folder} are runs on the same data but {differ} (see env_spec, env_code "
-        "and references in their config.json), so their scores do not compare; give a folder without one of them"
+        "and references in their config.json), so their scores are not comparable; give a folder without one of them"
     )
 
 
@@ -321,8 +321,8 @@ def _check_seeds(runs: Sequence[EvaluatedRun]) -> None:
     for one, other in itertools.pairwise(runs):
         if one.seed == other.seed:
             raise OffbenchError(
-                f"{one.files.folder} and {other.files.folder} are the same run twice: one seed counts once; "
-                "give a folder that holds each run once"
+                f"{one.files.folder} and {other.files.folder} are the same run; remove one of them, or "
+                "give a folder without it"
             )
 
 

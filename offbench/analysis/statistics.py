@@ -67,7 +67,9 @@ def improvement(a: Scores, b: Scores) -> Estimate:
     Raises:
         OffbenchError: they share no task.
     """
-    tasks = common(a, b)
+    tasks = [task for task in a if task in b]
+    if not tasks:
+        raise OffbenchError("the two methods share no task")
     pair = [{task: scores[task] for task in tasks} for scores in (a, b)]
     return _estimate(pair, lambda resampled: _share_above(*resampled), RESAMPLES)
 
@@ -117,14 +119,6 @@ def paired(differences: Scores) -> Paired:
         _sign_flip(differences),
         len(every),
     )
-
-
-def common(a: Scores, b: Scores) -> list[str]:
-    """Return the tasks that both have, in order of `a`. Raises OffbenchError if there are none."""
-    tasks = [task for task in a if task in b]
-    if not tasks:
-        raise OffbenchError("the two groups of runs share no task")
-    return tasks
 
 
 def _sign_flip(differences: Scores) -> float:

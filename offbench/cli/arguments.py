@@ -55,7 +55,7 @@ class Parser(argparse.ArgumentParser):
         self.error(f"unrecognized arguments: {flag}{hint}")
 
     def print_help(self, file: Any = None) -> None:
-        """Print the help, headings and flags in color on a terminal. Without rich: help must come at once."""
+        """Print the help, headings and flags in color on a terminal; rich is not imported, to keep --help fast."""
         text, stream = self.format_help(), file or sys.stdout
         if is_terminal(stream) and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb":
             text = re.sub(r"(?m)^(usage:|\S[^:\n]*:$)", "\033[1;32m\\1\033[0m", text)
@@ -125,9 +125,9 @@ def local_datasets() -> list[str]:
 
 def recipes() -> list[str]:
     """Return the names of the shipped recipes, for completion."""
-    from offbench.envs.recipes import names
+    from offbench.envs.recipes import shipped_recipes
 
-    return names()
+    return shipped_recipes()
 
 
 def levels() -> list[str]:
@@ -208,7 +208,7 @@ def seed_list(text: str) -> list[int]:
     except argparse.ArgumentTypeError as error:
         raise argparse.ArgumentTypeError(f"{error}; seeds are 3, 0,1,2 or 0:4 (0 to 3)") from None
     if not seeds:
-        raise argparse.ArgumentTypeError(f"{text!r} holds no seed")
+        raise argparse.ArgumentTypeError(f"{text!r} contains no seeds")
     if len(seeds) > MAX_SEEDS:
-        raise argparse.ArgumentTypeError(f"{text!r} are more than {MAX_SEEDS:,} seeds")
+        raise argparse.ArgumentTypeError(f"{text!r} has more than {MAX_SEEDS:,} seeds")
     return list(seeds)

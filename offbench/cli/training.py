@@ -195,7 +195,7 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
         finished = offbench.benchmark(
             bench, budget=budget, shard=shard, executor=ray_executor, say=_print, command=command
         )
-        if rows := normalize.score_some(bench.started()):  # a small budget ends before there are any
+        if rows := normalize.score_rows_of(bench.started()):  # a small budget ends before there are any
             print_scores(rows)
         runs = [] if arguments["runs"] == "runs" else ["--runs", arguments["runs"]]
         if finished:

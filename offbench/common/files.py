@@ -93,7 +93,7 @@ def exclusive_lock(path: Path, what: str, timeout: float = LOCK_TIMEOUT) -> Iter
     Raises:
         OffbenchError: another process holds it; its process id and host are named.
     """
-    from filelock import FileLock, Timeout  # here, so that help comes at once
+    from filelock import FileLock, Timeout  # imported here to keep --help fast
 
     lock, holder = FileLock(path), path.with_suffix(".holder")
     with write_errors(str(path.parent)):

@@ -16,7 +16,11 @@ from offbench.common.text import MAX_INT
 
 
 class Purpose(IntEnum):
-    """What random numbers are drawn for. Never renumber: recorded datasets depend on it."""
+    """What random numbers are drawn for. Never renumber: recorded datasets depend on it.
+
+    RUNG, MEASURE, REFERENCE and EVALUATION are only used as the first number of a stream: episode i of a stream is
+    reset with the seed [seed, RESET, *stream, i] and acts with [seed, ACTION, *stream, i].
+    """
 
     RESET = 1  # initial state of episode i
     ACTION = 2  # action noise of episode i
@@ -27,7 +31,7 @@ class Purpose(IntEnum):
     WEIGHTS = 7  # initial weights of network i
     CHUNK = 8  # batches and noise of chunk i of a run
     EVALUATION = 9  # the episodes of a run's evaluation at step i
-    SAMPLE = 11  # which transitions or episodes a figure or a check uses
+    SAMPLE = 11  # the transitions or episodes of a figure or a check
     BOOTSTRAP = 12  # the resampled seeds of a bootstrap interval
 
 

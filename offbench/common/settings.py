@@ -56,13 +56,9 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def fields(cls: type) -> Mapping[str, Field]:
-    """Return the fields of a settings class by name, those that a user may set."""
-    return _fields(cls)
-
-
 @functools.cache
-def _fields(cls: type) -> Mapping[str, Field]:
+def fields(cls: type) -> Mapping[str, Field]:
+    """Return the fields of a settings class that a user may set, by name."""
     return {f.name: f for f in dataclasses.fields(cls) if not f.metadata.get("internal")}
 
 

@@ -15,7 +15,7 @@ from offbench.common.files import sha256
 from offbench.common.terminal import warn
 from offbench.data.levels import FRACTION, LEVELS
 from offbench.rollouts.function_policy import FunctionPolicy, function_policy
-from offbench.rollouts.policy import Policy, load_policy
+from offbench.rollouts.policy import Policy, read_policy_file
 
 POLICY_FILE = "policy.safetensors"  # file name in a run's folder
 
@@ -54,7 +54,7 @@ def read_behaviour_policy(source: str, low: Array, high: Array, observation_dim:
     if path.suffix.lower() == ".zip":
         policy = read_sb3_zip(path, low, high, env_id)
     else:
-        policy = load_policy(path / POLICY_FILE if path.is_dir() else path)
+        policy = read_policy_file(path / POLICY_FILE if path.is_dir() else path)
     shapes = (len(policy.observation_mean), len(policy.low))
     if shapes != (observation_dim, len(low)):
         raise OffbenchError(

@@ -114,7 +114,7 @@ def _export_metadata(path: Path, file: h5py.File) -> JsonObject:
             deserialize_space(fields[key]) for key in ("observation_space", "action_space") if key in fields
         )
     except Exception as error:  # Gymnasium and Minari raise anything for JSON that is not theirs
-        raise OffbenchError(f"{path}: its offbench metadata are damaged ({error}); export the dataset again") from None
+        raise OffbenchError(f"{path}: its offbench metadata is damaged ({error}); export the dataset again") from None
     return fields | {"spaces": spaces}
 
 

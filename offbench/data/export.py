@@ -1,7 +1,7 @@
 """`export`: a Minari dataset as a D4RL file, or as the arrays that D4RL's loader would make of it.
 
 d4rl   HDF5, the recorded numbers as they are: what D4RL's get_dataset reads, and with it CORL and the TD3+BC
-       author's code. Minari's metadata are in the file's attributes, seeds in infos/seed: `import-d4rl` gives
+       author's code. Minari's metadata is in the file's attributes, seeds in infos/seed: `import-d4rl` gives
        the same dataset back.
 npz    float32, the keys of D4RL's qlearning_dataset: what their replay buffers take.
 """

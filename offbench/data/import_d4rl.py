@@ -46,7 +46,7 @@ from offbench.envs.environments import (
     untrusted_env,
 )
 from offbench.envs.margin_rule import MARGIN_KEY, SUM_RULE, without_margin
-from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference, load_recipe, names
+from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference_of_env, load_recipe, shipped_recipes
 from offbench.rollouts.rollouts import Episode
 
 BLOCK = 65_536  # rows read at once
@@ -139,7 +139,7 @@ def _origin(source: Source, env: str | Path | None) -> _Origin:
     if exported or "env_spec" in about:
         return _Origin(about.get("env_spec"), about.get("eval_env_spec"))
     word, _, rest = path.stem.lower().replace("-", "_").partition("_")
-    matches = [name for name in names() if word and name.replace("-", "_").startswith(word)]
+    matches = [name for name in shipped_recipes() if word and name.replace("-", "_").startswith(word)]
     if len(matches) != 1 or not rest.startswith(LEVEL_WORDS):
         raise OffbenchError(f"cannot tell the environment of {path.name}; give it, e.g. --env hopper")
     return _by_name(source, load_recipe(matches[0]))
@@ -313,7 +313,7 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
         "format": "offbench-import-1",
         "timeouts": "kept" if complete else "dropped",
         "final_observations": "kept" if complete else "repeated",
-        "d4rl": d4rl_reference(origin.recorded),
+        "d4rl": d4rl_reference_of_env(origin.recorded),
     }
     provenance |= about.get(minari_store.KEY, {})
     provenance["imported"] = {
@@ -338,7 +338,7 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
             warn(f"--env names another environment than {source.path} does, so its reference scores are left out")
             metadata = {key: value for key, value in metadata.items() if key not in ("ref_min_score", "ref_max_score")}
             provenance = {key: value for key, value in provenance.items() if key not in ("references", MARGIN_KEY)}
-            provenance["d4rl"] = d4rl_reference(metadata["eval_env_spec"])
+            provenance["d4rl"] = d4rl_reference_of_env(metadata["eval_env_spec"])
         if rule == SUM_RULE:
             provenance[MARGIN_KEY] = rule
         metadata[minari_store.KEY] = provenance
@@ -352,7 +352,7 @@ def _spaces(source: Source, recipe: Recipe | None) -> tuple[Space, Space]:
     if len(kept) == 2:
         boxes = tuple(box(space, f"{source.path}: its offbench metadata") for space in kept)
         if [space.shape for space in boxes] != [observations.shape[1:], actions.shape[1:]]:
-            raise OffbenchError(f"{source.path}: its offbench metadata are of other shapes; export the dataset again")
+            raise OffbenchError(f"{source.path}: its offbench metadata has other shapes; export the dataset again")
         return boxes[0], boxes[1]
     high = np.ones(actions.shape[1:], np.float32)
     low = -high

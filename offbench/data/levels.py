@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 
 from offbench.common.errors import OffbenchError, unknown
-from offbench.envs.recipes import names
+from offbench.envs.recipes import shipped_recipes
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def env_and_level(dataset_id: str) -> tuple[str, str]:
 def recipe_and_level(dataset_id: str) -> tuple[str, str]:
     """Return the shipped recipe and the `--level` that an id such as `hopper-60percent-v0` names, else ("", "")."""
     body = dataset_id.rpartition("-v")[0]
-    for env in sorted(names(), key=len, reverse=True):
+    for env in sorted(shipped_recipes(), key=len, reverse=True):
         level = body.removeprefix(f"{env}-")
         if level != body:
             return env, level_argument(level)

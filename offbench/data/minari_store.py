@@ -156,7 +156,7 @@ def read_metadata(dataset_id: str) -> JsonObject:
     """Return a local dataset's metadata as Minari wrote it.
 
     Raises:
-        OffbenchError: no such dataset (the nearest id is named), or its metadata are damaged.
+        OffbenchError: no such dataset (the nearest id is named), or its metadata is damaged.
     """
     path = root() / dataset_id / "data" / "metadata.json"
     if not exists(dataset_id):
@@ -289,7 +289,7 @@ def _check_nesting(dataset_id: str, path: Path) -> None:
 
 
 def _size(dataset_id: str) -> str:
-    """Return a dataset's transitions in brackets, "" if its metadata do not say."""
+    """Return a dataset's transitions in brackets, "" if its metadata does not say."""
     try:
         return f" ({read_metadata(dataset_id)['total_steps']:,} transitions)"
     except (OffbenchError, KeyError, TypeError):

@@ -14,7 +14,7 @@ from offbench.data import minari_store
 from offbench.envs import environments
 from offbench.envs.environments import Env, untrusted_env
 from offbench.envs.margin_rule import MAX_RULE, MUJOCO_VERSIONS, SUM_RULE, with_margin
-from offbench.envs.recipes import load_recipe, names
+from offbench.envs.recipes import load_recipe, shipped_recipes
 
 CLAUSE = re.compile(
     r"(==|~=|<=|>=|<|>)\s*(\d{1,6})(?:\.(\d{1,6}))?"
@@ -32,7 +32,7 @@ def make_env(name: str | Path, render_mode: str | None = None) -> Env:
         OffbenchError: there is no such dataset or recipe, it names no environment, or that cannot be made.
     """
     name = str(name)
-    if name in names() or Path(name).suffix == ".toml":
+    if name in shipped_recipes() or Path(name).suffix == ".toml":
         return environments.make_env(load_recipe(name).env_spec(), render_mode)
     metadata = minari_store.read_metadata(name)
     spec = evaluation_spec(metadata)
@@ -50,7 +50,7 @@ def evaluation_spec(metadata: JsonObject) -> str | None:
 
 
 def recorded_margin(metadata: JsonObject) -> str | None:
-    """Return the rule for contact margins that a dataset was recorded under; None if its metadata do not tell."""
+    """Return the rule for contact margins that a dataset was recorded under; None if its metadata does not say."""
     provenance = minari_store.read_provenance(metadata)
     recorded = "versions" in (metadata.get(minari_store.KEY) or {})  # by offbench, first with the earlier rule alone
     if provenance.contact_margin or recorded:
@@ -94,9 +94,9 @@ def report_margin_rule(dataset_id: str, metadata: JsonObject, env_spec: str) -> 
     if rule == MAX_RULE or not margins_matter(env_spec):
         return
     since, installed = MUJOCO_VERSIONS[rule or MAX_RULE], versions()["mujoco"]
-    message = f"{dataset_id}: contact margins as in MuJoCo {since} (installed is {installed})"
+    message = f"{dataset_id}: contact margins as in MuJoCo {since} ({installed} is installed)"
     if rule is None:
-        message += f"; its metadata do not tell, `offbench verify {dataset_id}` finds out"
+        message += f"; its metadata does not say; `offbench verify {dataset_id}` can find out"
     else:
         message += ", which recorded it"
     inform(message)

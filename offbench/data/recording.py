@@ -18,7 +18,7 @@ from offbench.envs.contact_margins import has_margins, model_of
 from offbench.envs.environments import make_env, spaces_of
 from offbench.envs.recipes import Recipe
 from offbench.rollouts.function_policy import FunctionPolicy
-from offbench.rollouts.policy import Policy, uniform
+from offbench.rollouts.policy import Policy, uniform_policy
 from offbench.rollouts.rollouts import Episode, Rollouts
 
 POLICY = "policy"  # the source of a part that a user's own policy plays
@@ -149,7 +149,7 @@ class Recording:
             return self.own_policy.policy
         if rung is not None:
             return self.ladder.load(rung)
-        return uniform(*self.bounds, self.observation_space.shape[0], self.recipe.env_id)
+        return uniform_policy(*self.bounds, self.observation_space.shape[0], self.recipe.env_id)
 
     def episodes(self) -> Iterator[Episode]:
         """Yield the episodes of all parts, in order; the last one of each part is cut short at its count."""

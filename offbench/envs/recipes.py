@@ -92,7 +92,7 @@ class Recipe:
         if self.d4rl_min is None or self.d4rl_max is None:
             return None
         if self.folder is None and _shipped_recipe(self.env_id):
-            return d4rl_reference(self.env_spec())
+            return d4rl_reference_of_env(self.env_spec())
         return self.d4rl_min, self.d4rl_max
 
     def sha256(self) -> str:
@@ -104,14 +104,14 @@ class Recipe:
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
-def shipped() -> Path:
+def recipes_folder() -> Path:
     """Return the folder with the shipped recipes."""
     return Path(str(importlib.resources.files("offbench"))) / "datasets"
 
 
-def names() -> list[str]:
+def shipped_recipes() -> list[str]:
     """Return the names of the shipped recipes."""
-    return sorted(path.parent.name for path in shipped().glob("*/recipe.toml"))
+    return sorted(path.parent.name for path in recipes_folder().glob("*/recipe.toml"))
 
 
 def load_recipe(name: str | Path) -> Recipe:
@@ -123,9 +123,9 @@ def load_recipe(name: str | Path) -> Recipe:
     name = str(name)
     if name.endswith(".toml") or "/" in name:
         return read_recipe(Path(name), folder=None)
-    path = shipped() / name / "recipe.toml"
-    if name not in names():
-        raise unknown("environment", name, names())
+    path = recipes_folder() / name / "recipe.toml"
+    if name not in shipped_recipes():
+        raise unknown("environment", name, shipped_recipes())
     return read_recipe(path, folder=path.parent)
 
 
@@ -136,7 +136,9 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
         with read_errors(where, "is not a readable TOML file", "correct it, or name another"):
             values = tomllib.loads(read_text(path))
     except FileNotFoundError:
-        raise OffbenchError(f"no recipe file {path}; write one, or name a shipped one: {', '.join(names())}") from None
+        raise OffbenchError(
+            f"no recipe file {path}; write one, or name a shipped one: {', '.join(shipped_recipes())}"
+        ) from None
     values.setdefault("name", path.stem if folder is None else folder.name)
 
     def table(cls: type[T], key: str) -> T:
@@ -147,7 +149,7 @@ def read_recipe(path: Path, folder: Path | None) -> Recipe:
     recipe = build(Recipe, values, where)
     recipe = dataclasses.replace(recipe, env_kwargs=kwargs, folder=folder, sac=sac, measure=measure)
     _check(recipe, where)
-    shipped_one = load_recipe(recipe.name) if folder is None and recipe.name in names() else recipe
+    shipped_one = load_recipe(recipe.name) if folder is None and recipe.name in shipped_recipes() else recipe
     if recipe.env_id != shipped_one.env_id:
         raise OffbenchError(
             f"{where}: {recipe.name} is a shipped environment, {shipped_one.env_id}, and its datasets would have the "
@@ -200,10 +202,10 @@ D4RL_LIMIT = 1000  # steps of an episode of D4RL's MuJoCo tasks
 def _shipped_recipe(env_id: str) -> Recipe | None:
     """Return the shipped recipe of an environment's task, of any of D4RL's and Gymnasium's versions v2 to v5."""
     task = D4RL_TASK.fullmatch(env_id)
-    return next((r for r in map(load_recipe, names()) if task and r.env_id.startswith(f"{task[1]}-v")), None)
+    return next((r for r in map(load_recipe, shipped_recipes()) if task and r.env_id.startswith(f"{task[1]}-v")), None)
 
 
-def d4rl_reference(env_spec: str | None) -> tuple[float, float] | None:
+def d4rl_reference_of_env(env_spec: str | None) -> tuple[float, float] | None:
     """Return D4RL's reference returns (random, expert) of an environment (EnvSpec JSON).
 
     They hold for the standard task alone (its versions v2 to v5): None for any other environment, and where arguments,

@@ -10,7 +10,10 @@ def warn_other_physics(what: str, recorded: dict[str, str], env_spec: str) -> No
     """Print a warning when `what` was made on a MuJoCo that simulates an environment (EnvSpec JSON) differently."""
     made, here = recorded.get("mujoco", ""), versions()["mujoco"]
     if made and not same_physics(made, here, env_spec):
-        warn(f"{what} was made with mujoco {made}, installed is {here}: the physics differ, scores may not compare")
+        warn(
+            f"{what} was made with mujoco {made}, but {here} is installed: the physics differ, so scores may not be "
+            "comparable"
+        )
 
 
 def same_physics(a: str, b: str, env_spec: str) -> bool:

@@ -20,7 +20,7 @@ from offbench.common.text import counted
 from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import check_spec, env_spec, same_environment
 from offbench.envs.margin_rule import MUJOCO_VERSIONS, SUM_RULE, without_margin
-from offbench.envs.recipes import d4rl_reference, load_recipe
+from offbench.envs.recipes import d4rl_reference_of_env, load_recipe
 from offbench.envs.trust import REMEDY, is_trusting
 from offbench.evaluation.policies import load_policy
 from offbench.rollouts.policy import Policy
@@ -96,7 +96,7 @@ def evaluate(
     if config is not None and same_environment(config.env_spec, spec):
         references = config.references
     else:
-        references = {"dataset": shipped_references(spec), "d4rl": d4rl_reference(spec)}
+        references = {"dataset": shipped_references(spec), "d4rl": d4rl_reference_of_env(spec)}
     scores = {key: normalize(float(np.mean(returns)), *pair) for key, pair in references.items() if pair}
     physics = (
         f" with contact margins as in MuJoCo {MUJOCO_VERSIONS[SUM_RULE]}"

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from offbench.common.errors import OffbenchError
 from offbench.common.text import printable
-from offbench.rollouts.policy import Policy
-from offbench.rollouts.policy import load_policy as read_policy
+from offbench.rollouts.policy import Policy, read_policy_file
 from offbench.training.run import Run
 
 
@@ -22,12 +21,12 @@ def load_policy(path: str | Path) -> Policy:
     """
     path = Path(path)
     if not path.is_dir():
-        return read_policy(path)
+        return read_policy_file(path)
     run = Run(path)
     config = run.config()
     if not run.policy_path.exists():
         raise OffbenchError(f"{path} has no policy yet; train the run to its first checkpoint")
-    policy = read_policy(run.policy_path)
+    policy = read_policy_file(run.policy_path)
     for key in ("seed", "dataset_sha256"):
         found = policy.origin.get(key, getattr(config, key))
         if found != getattr(config, key):

@@ -28,7 +28,7 @@ from offbench.envs.environments import Env, make_env, spaces_of, time_limit
 from offbench.envs.recipes import load_recipe
 from offbench.evaluation.evaluate import open_policy
 from offbench.evaluation.renderer import NO_RENDERER, rendering_with, working_backend
-from offbench.rollouts.policy import Policy, uniform
+from offbench.rollouts.policy import Policy, uniform_policy
 from offbench.rollouts.rollouts import reset, step
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def _policy_of(path: str, env: str | Path | None) -> tuple[Policy, str, bool]:
     spec = recipe.env_spec()
     if source == "uniform":
         observations, actions = spaces_of(make_env(spec), recipe.env_id)
-        return uniform(actions.low, actions.high, observations.shape[0], recipe.env_id), spec, True
+        return uniform_policy(actions.low, actions.high, observations.shape[0], recipe.env_id), spec, True
     if source == "replay" or more:
         raise OffbenchError(f"{level} is not of one policy; choose random, medium, expert or a fraction")
     ladder = find_ladder(recipe)

@@ -224,13 +224,13 @@ def _forward(layers: Layers, x: Array, activation: str) -> Array:
     return out
 
 
-def uniform(low: Array, high: Array, observation_dim: int, env_id: str) -> Policy:
+def uniform_policy(low: Array, high: Array, observation_dim: int, env_id: str) -> Policy:
     """Return the policy that draws actions uniformly in the bounds, as D4RL's random level did."""
     zeros, ones = np.zeros(observation_dim, np.float32), np.ones(observation_dim, np.float32)
     return Policy("uniform", (), zeros, ones, low, high, env_id, {"algorithm": "uniform"})
 
 
-def load_policy(path: str | os.PathLike[str]) -> Policy:
+def read_policy_file(path: str | os.PathLike[str]) -> Policy:
     """Read a policy file. Raises OffbenchError if it is not one, or is damaged."""
     try:
         with read_errors(str(path), "is not a readable policy file", "give another, or write it again"):

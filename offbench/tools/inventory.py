@@ -12,7 +12,7 @@ from offbench.common.files import JsonObject
 from offbench.common.terminal import warn
 from offbench.data import minari_store
 from offbench.data.levels import LEVELS
-from offbench.envs.recipes import load_recipe, names
+from offbench.envs.recipes import load_recipe, shipped_recipes
 from offbench.training.registry import algorithm_names
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def inventory(what: str | None = None, *, runs: str | Path = "runs") -> JsonObje
             if none was; `score` and `d4rl_score` are those of `offbench.normalize`, None without such a reference.
 
     Raises:
-        OffbenchError: an unknown `what`, or the same run is there twice. Damaged runs are named on stderr and left
+        OffbenchError: an unknown `what`, or a duplicated run. Damaged runs are named on stderr and left
             out.
     """
     parts: dict[str, Callable[[], object]] = {
@@ -48,7 +48,7 @@ def inventory(what: str | None = None, *, runs: str | Path = "runs") -> JsonObje
 
 def _environments() -> JsonObject:
     environments = {}
-    for name in names():
+    for name in shipped_recipes():
         recipe = load_recipe(name)
         ladder = read_ladder(recipe.folder / "behaviour") if recipe.folder else None
         environments[name] = {

@@ -110,12 +110,12 @@ class CapturedUpdate:
         if latest is not None:
             if phase in self._traces and not latest.same_as(self._traces[phase]):
                 reason = reason or f"is not the same at every update of phase {phase!r}"
-            if done <= TRACED_UPDATES:  # a later latest is only compared with the one in use
+            if done <= TRACED_UPDATES:  # later traces are only compared with the one in use
                 self._traces[phase] = latest
         if reason and done > TRACED_UPDATES:
             name = type(self.algorithm).__name__
             raise OffbenchError(
-                f"{name}.update {reason} after {done:,} updates; let `phase` tell apart what differs, or set "
+                f"{name}.update {reason} after {done:,} updates; return different phases for updates that differ, or set "
                 f"`capture = False` in class {name}"
             )
         if reason:

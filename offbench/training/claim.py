@@ -12,7 +12,7 @@ from offbench.common.provenance import training_platform
 from offbench.data.transitions import Transitions
 from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import same_environment
-from offbench.envs.recipes import d4rl_reference
+from offbench.envs.recipes import d4rl_reference_of_env
 from offbench.training.datasets import Datasets
 from offbench.training.run import TRAIN_ANEW
 from offbench.training.run_config import RunConfig
@@ -109,7 +109,7 @@ def new_run_config(spec: RunSpec, data: Transitions, device: str, command: str) 
         steps=spec.steps,
         eval_every=spec.eval_every,
         eval_episodes=spec.eval_episodes,
-        references={"dataset": data.references, "d4rl": d4rl_reference(data.env_spec)},
+        references={"dataset": data.references, "d4rl": d4rl_reference_of_env(data.env_spec)},
         env_id=data.env_id,
         env_spec=data.env_spec,
         env_code=environment_code(data.env_spec) if data.env_spec else {},

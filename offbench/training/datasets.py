@@ -41,7 +41,9 @@ def check_datasets(datasets: Datasets) -> None:
             if data.evaluated_in is None:
                 report_margin_rule(name, data.metadata, data.env_spec)
                 if changed := describe_changes(recorded.env_code, environment_code(data.env_spec)):
-                    warn(f"{name} was recorded in other code of its environment: {changed}; scores may not compare")
+                    warn(
+                        f"{name} was recorded in other code of its environment: {changed}; scores may not be comparable"
+                    )
             warn_other_physics(name, recorded.versions, data.env_spec)
         else:
             inform(

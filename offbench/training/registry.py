@@ -50,7 +50,7 @@ def _entry_points() -> dict[str, list[importlib.metadata.EntryPoint]]:
     for package in importlib.metadata.distributions():
         try:
             points = package.entry_points.select(group=GROUP)
-        except Exception as error:  # a package whose metadata are damaged must not stop the others
+        except Exception as error:  # a package whose metadata is damaged must not stop the others
             where = getattr(package, "_path", package)  # its name may be unreadable too
             warn(f"{where} has unreadable entry points ({error}); reinstall or remove this package")
             continue

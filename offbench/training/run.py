@@ -225,7 +225,7 @@ class Run:
         """Return {step: [(return, length) of each episode]} in order of steps; {} if there are none yet.
 
         Raises:
-            OffbenchError: the file is damaged: a row is malformed, an episode is missing or there twice, or the steps
+            OffbenchError: the file is damaged: a row is malformed, an episode is missing or duplicated, or the steps
                 are not those at which config.json has evaluations.
         """
         if not self.evaluations_path.exists():
@@ -250,7 +250,7 @@ class Run:
                         raise ValueError(f"step {step} of a run of {last} steps")
                     episodes = evaluations.setdefault(step, [])
                     if _count(row["episode"]) != len(episodes):
-                        raise ValueError(f"episode {len(episodes)} of step {step} is missing, or one is there twice")
+                        raise ValueError(f"episode {len(episodes)} of step {step} is missing, or one is duplicated")
                     episodes.append((value, _count(row["length"])))
             for step, episodes in evaluations.items():
                 if len(episodes) != (count or len(episodes)):

@@ -137,7 +137,7 @@ def _replay(
     made, here = recorded_mujoco(metadata), versions()["mujoco"]
     exact = made == here
     if made is not None and not exact:
-        report.warnings.append(f"recorded with mujoco {made}, installed is {here}: compared within a tolerance")
+        report.warnings.append(f"recorded with mujoco {made}, but {here} is installed: compared within a tolerance")
     last_unknown = minari_store.read_provenance(metadata).final_observations == "repeated"
     steps = sum(scanned.lengths[i] for i in chosen)
     names = [int(data.episode_indices[i]) for i in chosen]
@@ -160,7 +160,7 @@ def _replay(
             if off[MAX_RULE] != off[SUM_RULE]:
                 report.warnings.append(
                     f"recorded with the contact margins of MuJoCo {MUJOCO_VERSIONS[rule]}, as "
-                    f"{counted(len(some), 'episode')} show, and its metadata do not tell: add {REQUIREMENT[rule]!r} "
+                    f"{counted(len(some), 'episode')} show; its metadata does not say. Add {REQUIREMENT[rule]!r} "
                     "to its requirements, so that policies are evaluated with them"
                 )
         replays = replay(with_margin(spec, rule or MAX_RULE), episodes_of(data, names))

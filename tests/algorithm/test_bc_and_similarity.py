@@ -15,7 +15,7 @@ import offbench
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.evaluation.similarity import similarity
-from offbench.rollouts.policy import load_policy
+from offbench.rollouts.policy import read_policy_file
 from offbench.training.restore import restore
 from offbench.training.run import Run
 from tests.data.test_transitions import episode, foreign
@@ -43,7 +43,7 @@ def test_bc_clones_the_data_and_top_the_best_of_it() -> None:
     whole, top = offbench.train("bc", name, steps=500, top=[1.0, 0.1], learning_rate=3e-3, **SMALL)
     data = offbench.load(name)
     states = data.observations[data.rows[:20]]
-    all_actions, top_actions = (load_policy(f / "policy.safetensors").act(states, None) for f in (whole, top))
+    all_actions, top_actions = (read_policy_file(f / "policy.safetensors").act(states, None) for f in (whole, top))
     # squared error over nine parts low and one part high: the mean, -0.8 of the half span
     np.testing.assert_allclose(all_actions.mean(0), [-1.6, 1.0], atol=0.3)
     np.testing.assert_allclose(top_actions.mean(0), [2.0, 10.0], atol=0.2)
@@ -57,7 +57,7 @@ def test_similar_score_by_hand(medium: str) -> None:
     rng = np.random.default_rng(np.random.SeedSequence([0, 11]))
     chosen = rng.integers(len(data), size=(1, 400))[0]
     states, actions = data.observations[data.rows[chosen]], data.actions[chosen]
-    pi = load_policy(folder / "policy.safetensors").act(states, None) / 3  # the pendulum's actions span [-3, 3]
+    pi = read_policy_file(folder / "policy.safetensors").act(states, None) / 3  # the pendulum's actions span [-3, 3]
     mean, std = data.normalizer()
     inputs = torch.from_numpy((states - mean) / std).unsqueeze(0)
     critic: Any = stack.algorithm.learned["critic"]

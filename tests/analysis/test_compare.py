@@ -109,7 +109,9 @@ def test_a_variant_may_be_named_as_tables_name_it(home: Path) -> None:
     for name in ("bdb", "bdb (adaptive)", "bdb/default", "bdb/beta=adaptive", "bdb/adaptive", "bdb beta=adaptive"):
         assert compare(name, "td3_bc", runs="runs").a == "bdb (adaptive)"
     assert compare("bdb (adaptive) (30,000 steps)", "td3_bc", runs="runs").a == "bdb (adaptive)"  # a column's heading
-    with pytest.raises(OffbenchError, match=r"cql has no evaluated runs here; there are 'td3_bc', 'bdb \(adaptive\)'"):
+    with pytest.raises(
+        OffbenchError, match=r"cql has no evaluated runs here; available: 'td3_bc', 'bdb \(adaptive\)'"
+    ):
         compare("cql", "td3_bc", runs="runs")
 
 

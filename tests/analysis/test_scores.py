@@ -18,7 +18,7 @@ from offbench.analysis.normalize import FORMATS, notes, render
 from offbench.analysis.results import read_results
 from offbench.cli.main import main
 from offbench.common.scores import interval, mean_std, normalize, run_return
-from offbench.envs.recipes import d4rl_reference
+from offbench.envs.recipes import d4rl_reference_of_env
 from offbench.reports.figures import plot_curves
 from offbench.training.run import Run, find_runs
 from offbench.training.run_config import RunConfig
@@ -43,7 +43,7 @@ def test_d4rls_references_are_those_of_its_infos() -> None:
     }.items():
         name = env_id.partition("-")[0]
         spec = EnvSpec(env_id, f"gymnasium.envs.mujoco.{name.lower()}:{name}Env", max_episode_steps=1000)
-        assert d4rl_reference(spec.to_json()) == reference
+        assert d4rl_reference_of_env(spec.to_json()) == reference
 
 
 def test_the_interval_is_students_t() -> None:
@@ -258,4 +258,4 @@ def test_a_seed_that_is_there_twice_counts_for_nobody(capsys: pytest.CaptureFixt
     write_run(0, [90.0], runs="runs/copy")
     with pytest.raises(SystemExit):
         main(["normalize"])
-    assert "are the same run twice" in capsys.readouterr().err
+    assert "are the same run" in capsys.readouterr().err

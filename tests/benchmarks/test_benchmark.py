@@ -379,7 +379,7 @@ def test_a_run_that_diverged_before_is_said_and_left_alone(grid: str, home: Path
     said: list[str] = []
     assert benchmark(prepare(grid, workers=1), say=said.append)
     assert (
-        said[-1] == f"{run.folder.relative_to(home)} has diverged and is not trained further; delete it to repeat it"
+        said[-1] == f"{run.folder.relative_to(home)} diverged earlier and is skipped; delete it to train the run again"
     )
 
 

@@ -70,7 +70,7 @@ CASES: dict[str, tuple[str, str]] = {
     "train bdb --dataset MEDIUM --hidden 256x": ("hidden must be a list of whole numbers like 256,256 or", "256x256"),
     "train bdb --dataset MEDIUM --normalize perhaps": ("normalize must be true or false, not 'perhaps'", ""),
     "train bdb --dataset MEDIUM --beta-scope world": ("beta_scope must be one of sample, batch", ""),
-    "train bdb --dataset MEDIUM --seeds 3:3": ("'3:3' holds no seed", ""),
+    "train bdb --dataset MEDIUM --seeds 3:3": ("'3:3' contains no seeds", ""),
     "train bdb --dataset MEDIUM --seeds a": ("'a' is not a whole number from 0", ""),
     "train bdb --dataset MEDIUM --seeds 0-3": ("'0-3' is not a whole number from 0; seeds are 3, 0,1,2 or 0:4", ""),
     "train bdb --dataset MEDIUM --seeds 1,1": ("seeds must be different whole numbers", ""),
@@ -356,7 +356,7 @@ def test_a_ladder_of_another_environment_is_refused(tiny: tuple[str, str], home:
 
 
 def test_a_share_of_nothing(tiny: tuple[str, str]) -> None:
-    with pytest.raises(offbench.OffbenchError, match="leave a part of the blend without a transition"):
+    with pytest.raises(offbench.OffbenchError, match="leave a part of the mix without transitions"):
         offbench.collect(tiny[0], mix="random:0.01,expert:0.99", steps=10, behaviour_dir=tiny[1])
 
 

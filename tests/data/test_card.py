@@ -15,9 +15,9 @@ from offbench.common.files import read_json
 from offbench.common.provenance import versions
 from offbench.data.card import card, compare_with_card
 from offbench.data.levels import LEVELS
-from offbench.envs.recipes import load_recipe, names
+from offbench.envs.recipes import load_recipe, shipped_recipes
 
-CARDS = [name for name in names() if (load_recipe(name).folder or Path()).joinpath("card.json").exists()]
+CARDS = [name for name in shipped_recipes() if (load_recipe(name).folder or Path()).joinpath("card.json").exists()]
 
 
 def shipped(name: str) -> Path:
@@ -27,7 +27,7 @@ def shipped(name: str) -> Path:
 
 
 def test_every_shipped_ladder_has_a_card() -> None:
-    shipped_ladders = [name for name in names() if (shipped(name) / "behaviour" / "ladder.json").exists()]
+    shipped_ladders = [name for name in shipped_recipes() if (shipped(name) / "behaviour" / "ladder.json").exists()]
     assert shipped_ladders == CARDS
 
 

@@ -274,7 +274,7 @@ def test_a_replaced_dataset_that_cannot_be_put_back_is_named(tiny: tuple[str, st
 
 
 def test_environments_that_reuse_their_array_are_recorded_right() -> None:
-    from offbench.rollouts.policy import uniform
+    from offbench.rollouts.policy import uniform_policy
     from offbench.rollouts.rollouts import EpisodeTask, _RunningEpisode
 
     class Reusing(gym.Env[Any, Any]):
@@ -292,7 +292,7 @@ def test_environments_that_reuse_their_array_are_recorded_right() -> None:
             self.state += 1
             return self.state, 0.0, bool(self.state[0] == 3), False, {}
 
-    policy = uniform(np.full(1, -1, np.float32), np.full(1, 1, np.float32), 1, "X-v0")
+    policy = uniform_policy(np.full(1, -1, np.float32), np.full(1, 1, np.float32), 1, "X-v0")
     lane = _RunningEpisode(Reusing(), policy, EpisodeTask("", b"", 0, (), (0,), False), 0)
     episode = next(e for e in (lane.step(np.full(1, 0.5, np.float32)) for _ in range(9)) if e)
     np.testing.assert_array_equal(episode.observations[:, 0], [0, 1, 2, 3])

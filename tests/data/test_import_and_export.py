@@ -314,16 +314,16 @@ SPOILED = {
     "a raw file outside": "rewards is not data of this file",
     "huge": "more than the file can hold",
     "next": "differ from observations",
-    "{": "metadata are damaged",
-    "5": "metadata are damaged",
+    "{": "metadata is damaged",
+    "5": "metadata is damaged",
     "[]": "",  # no metadata of ours in it, and nothing that harms: it is imported
-    '{"env_spec": 5}': "metadata are damaged",
-    '{"env_spec": "{}"}': "metadata are damaged",
-    '{"offbench": []}': "metadata are damaged",
-    '{"author": 5}': "metadata are damaged",
-    '{"ref_min_score": NaN}': "metadata are damaged",
-    '{"observation_space": "{}", "action_space": "{}"}': "metadata are damaged",
-    "[" * 5000: "metadata are damaged",
+    '{"env_spec": 5}': "metadata is damaged",
+    '{"env_spec": "{}"}': "metadata is damaged",
+    '{"offbench": []}': "metadata is damaged",
+    '{"author": 5}': "metadata is damaged",
+    '{"ref_min_score": NaN}': "metadata is damaged",
+    '{"observation_space": "{}", "action_space": "{}"}': "metadata is damaged",
+    "[" * 5000: "metadata is damaged",
 }
 
 

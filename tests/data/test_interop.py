@@ -21,9 +21,9 @@ import offbench
 from offbench.agents.ladder import read_ladder
 from offbench.common.errors import OffbenchError
 from offbench.data import minari_store
-from offbench.envs.recipes import shipped
+from offbench.envs.recipes import recipes_folder
 from offbench.evaluation.export_policy import export_policy
-from offbench.rollouts.policy import Policy, load_policy, uniform
+from offbench.rollouts.policy import Policy, read_policy_file, uniform_policy
 from offbench.training.run import Run
 from tests import beside_d3rlpy
 from tests.conftest import ROOT
@@ -122,7 +122,7 @@ OBSERVATIONS = np.random.default_rng(0).normal(scale=3, size=(500, 11))
 
 def hopper_expert() -> Path:
     """The file of the shipped expert."""
-    ladder = read_ladder(shipped() / "hopper" / "behaviour")
+    ladder = read_ladder(recipes_folder() / "hopper" / "behaviour")
     assert ladder is not None
     return ladder.folder / "policies" / ladder.role("expert").policy
 
@@ -138,11 +138,11 @@ def onnx_actions(path: Path, observations: Any) -> Any:
 def test_a_policy_as_torchscript_acts_the_same(kind: str, medium: str, home: Path) -> None:
     if kind == "the shipped expert":
         source = hopper_expert()
-        policy = load_policy(source)
+        policy = read_policy_file(source)
     else:
         settings: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "eval_every": 50, "eval_episodes": 1}
         (source,) = offbench.train(kind, medium, steps=50, **settings)
-        policy = load_policy(Run(source).policy_path)
+        policy = read_policy_file(Run(source).policy_path)
     out = offbench.export_policy(source, home / "policy.pt")
     extra = {"offbench.json": ""}
     scripted = torch.jit.load(out, _extra_files=extra)
@@ -189,7 +189,7 @@ def test_every_kind_that_acts_by_itself(kind: str, activation: str, home: Path, 
 
 
 def test_policies_that_act_by_chance_are_refused(home: Path) -> None:
-    uniform(-np.ones(1, np.float32), np.ones(1, np.float32), 4, "X-v0").save(home / "random.safetensors")
+    uniform_policy(-np.ones(1, np.float32), np.ones(1, np.float32), 4, "X-v0").save(home / "random.safetensors")
     for name in ("policy.pt", "policy.onnx"):
         with pytest.raises(OffbenchError, match="is random"):
             export_policy(home / "random.safetensors", home / name)

@@ -21,7 +21,7 @@ from offbench.data.recorded_env import recorded_margin
 from offbench.envs.contact_margins import SUMMED_SINCE, release
 from offbench.envs.environments import env_spec
 from offbench.envs.margin_rule import MAX_RULE, SUM_RULE, with_margin, without_margin
-from offbench.rollouts.policy import load_policy
+from offbench.rollouts.policy import read_policy_file
 from offbench.verification.verify import verify
 
 with warnings.catch_warnings():
@@ -56,7 +56,7 @@ def record_theirs(name: str, requirements: list[str] | None) -> list[EpisodeBuff
 
 def played_by_gymnasium(policy_file: Path, count: int) -> list[float]:
     """Return the returns of the evaluation episodes, played with Gymnasium alone."""
-    env, policy, returns = gym.make("Hopper-v5"), load_policy(policy_file), []
+    env, policy, returns = gym.make("Hopper-v5"), read_policy_file(policy_file), []
     for i in range(count):
         observation, _ = env.reset(seed=seeds.integer(0, Purpose.RESET, int(Purpose.REFERENCE), 2, i))
         returns.append(0.0)

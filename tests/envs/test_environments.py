@@ -25,8 +25,8 @@ from offbench.envs.environments import (
     same_environment,
     untrusted_env,
 )
-from offbench.envs.recipes import d4rl_reference
-from offbench.rollouts.policy import uniform
+from offbench.envs.recipes import d4rl_reference_of_env
+from offbench.rollouts.policy import uniform_policy
 from offbench.rollouts.rollouts import ErrorReporting, Rollouts, gather, scalar_reward
 from offbench.verification.resimulate import replay_episode
 
@@ -68,7 +68,7 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def play(spec: str) -> list[float]:
-    policy = uniform(np.full(1, -1, np.float32), np.full(1, 1, np.float32), 3, "Steps-v0")
+    policy = uniform_policy(np.full(1, -1, np.float32), np.full(1, 1, np.float32), 3, "Steps-v0")
     with Rollouts(spec) as rollouts:
         return [stats.ret for stats in gather(rollouts.start_evaluation(policy, 0, (), 2, False))]
 
@@ -86,7 +86,7 @@ def play(spec: str) -> list[float]:
 def test_d4rls_scores_are_of_the_standard_task_alone(changes: dict[str, Any], reference: Any) -> None:
     spec = gym.make("Hopper-v5", **changes).spec
     assert spec is not None
-    assert d4rl_reference(spec.to_json()) == reference
+    assert d4rl_reference_of_env(spec.to_json()) == reference
 
 
 @pytest.mark.parametrize(
@@ -117,15 +117,16 @@ def test_wrappers_and_other_namespaces_have_no_d4rl_score() -> None:
     changed = gym.wrappers.NormalizeReward(gym.make("Hopper-v5")).spec
     assert watched is not None
     assert changed is not None
-    assert d4rl_reference(watched.to_json()) == HOPPER
-    assert d4rl_reference(changed.to_json()) is None
+    assert d4rl_reference_of_env(watched.to_json()) == HOPPER
+    assert d4rl_reference_of_env(changed.to_json()) is None
     assert (
-        d4rl_reference(EnvSpec("Hopper-v2", "gym.envs.mujoco:HopperEnv", max_episode_steps=1000).to_json()) == HOPPER
+        d4rl_reference_of_env(EnvSpec("Hopper-v2", "gym.envs.mujoco:HopperEnv", max_episode_steps=1000).to_json())
+        == HOPPER
     )
     for other in ({"id": "frogs/Hopper-v5"}, {"id": "Hopper-v9"}, {"entry_point": "frogs:Frog"}):
-        assert d4rl_reference(json.dumps(plain | other)) is None
-    assert d4rl_reference(env_spec("InvertedPendulum-v5")) is None
-    assert d4rl_reference(None) is None
+        assert d4rl_reference_of_env(json.dumps(plain | other)) is None
+    assert d4rl_reference_of_env(env_spec("InvertedPendulum-v5")) is None
+    assert d4rl_reference_of_env(None) is None
 
 
 @pytest.mark.parametrize("bound", [np.finfo(np.float32).max, 1e30, 2e6])

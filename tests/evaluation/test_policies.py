@@ -12,7 +12,7 @@ import pytest
 import offbench
 from offbench.benchmarks.grid import load_grid
 from offbench.cli.main import main
-from offbench.rollouts.policy import Policy, uniform
+from offbench.rollouts.policy import Policy, uniform_policy
 from offbench.training.run import Run
 
 SMALL: dict[str, Any] = {
@@ -55,7 +55,7 @@ def test_a_policy_plays_in_a_gymnasium_loop(medium: str, home: Path) -> None:
 
 def test_policies_that_choose_at_random_need_no_noise_either() -> None:
     low, high = np.array([-1.0, 0.0], np.float32), np.array([1.0, 5.0], np.float32)
-    policy = uniform(low, high, 3, "x")
+    policy = uniform_policy(low, high, 3, "x")
     actions = policy(np.zeros((1000, 3)))
     assert ((actions >= low) & (actions <= high)).all()
     assert np.abs(actions.mean(0) - [0, 2.5]).max() < 0.3

@@ -12,12 +12,12 @@ import pytest
 from PIL import Image
 
 from offbench.common.errors import OffbenchError
-from offbench.envs.recipes import shipped
+from offbench.envs.recipes import recipes_folder
 from offbench.evaluation import renderer, video
 from tests.cli.test_bad_input import refusal
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]
-POLICY = next((shipped() / "inverted-pendulum" / "behaviour" / "policies").glob("*.safetensors"))
+POLICY = next((recipes_folder() / "inverted-pendulum" / "behaviour" / "policies").glob("*.safetensors"))
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from offbench.cli.main import main
 from offbench.common import files
 from offbench.data import file_stamps, minari_store, minari_writer, transitions
 from offbench.data.minari_reader import episodes_of, open_minari
-from offbench.rollouts.policy import uniform
+from offbench.rollouts.policy import uniform_policy
 from tests.cli.test_bad_input import refusal
 
 REWARDS = "episode_0/rewards"
@@ -257,7 +257,7 @@ def test_a_module_that_a_policy_names_is_not_imported(home: Path, monkeypatch: p
     (home / "evil.py").write_text("open('PWNED', 'w')")
     monkeypatch.syspath_prepend(str(home))
     low, high = np.array([-3.0], np.float32), np.array([3.0], np.float32)
-    policy = uniform(low, high, 4, "evil:Evil-v0")
+    policy = uniform_policy(low, high, 4, "evil:Evil-v0")
     policy.save(home / "evil.safetensors")
     with pytest.raises(offbench.OffbenchError, match=r"'evil:Evil-v0'.*--env"):
         offbench.evaluate("evil.safetensors", episodes=1)

@@ -35,9 +35,9 @@ from offbench.data import minari_store
 from offbench.data.import_d4rl import import_d4rl
 from offbench.data.show import Summary
 from offbench.data.transitions import Transitions
-from offbench.envs.recipes import load_recipe, read_recipe, shipped
+from offbench.envs.recipes import load_recipe, read_recipe, recipes_folder
 from offbench.envs.version_warning import warn_other_physics
-from offbench.rollouts.policy import Policy, load_policy
+from offbench.rollouts.policy import Policy, read_policy_file
 from offbench.training.run import Run
 from tests.data.test_import_and_export import d4rl_file
 from tests.faults.spoil import WOUNDS, spoiled_json, spoiled_tensors, spoiled_words, wounded
@@ -47,7 +47,7 @@ CASES = NEW or 12_500  # of each of the readers below, in the slow run
 PARTS = max(1, NEW // 10_000)  # a test each, for `make nightly`
 FEW = 40  # in the fast one
 QUICK = datetime.timedelta(seconds=20)  # a case that takes longer hangs
-LADDER = shipped() / "inverted-pendulum" / "behaviour"
+LADDER = recipes_folder() / "inverted-pendulum" / "behaviour"
 
 
 class Unpickled(BaseException):
@@ -80,7 +80,7 @@ def recipe(folder: Path, data: bytes) -> object:
 
 def policy(folder: Path, data: bytes) -> object:
     (folder / "policy.safetensors").write_bytes(data)
-    found = load_policy(folder / "policy.safetensors")
+    found = read_policy_file(folder / "policy.safetensors")
     observations = np.zeros((2, len(found.observation_mean)))
     noise = found.draw(np.random.default_rng(0), 2) if found.needs_noise(deterministic=True) else None
     actions = found.act(observations, noise)

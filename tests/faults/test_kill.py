@@ -24,7 +24,7 @@ from offbench.data import minari_store
 from offbench.data.content_hash import ContentHash
 from offbench.data.export import export
 from offbench.data.minari_reader import episodes_of, open_minari
-from offbench.rollouts.policy import load_policy
+from offbench.rollouts.policy import read_policy_file
 from offbench.training.run import Run, find_runs
 from tests.conftest import ROOT
 
@@ -259,7 +259,7 @@ def sound(run: Run) -> int:
     run.evaluations()
     run.losses()
     if run.policy_path.exists():
-        load_policy(run.policy_path)
+        read_policy_file(run.policy_path)
     steps = checkpoints.steps(run.folder)
     assert all(checkpoints.load_checkpoint(run.folder, step) for step in steps)
     return max(steps, default=0)

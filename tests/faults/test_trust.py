@@ -18,7 +18,7 @@ from offbench.common.errors import OffbenchError
 from offbench.envs.environments import env_spec
 from offbench.envs.trust import VARIABLE, check_code
 from offbench.evaluation.evaluate import evaluate, open_policy
-from offbench.rollouts.policy import uniform
+from offbench.rollouts.policy import uniform_policy
 from tests.cli.test_bad_input import refusal
 from tests.faults.test_integrity import trained
 
@@ -87,7 +87,7 @@ def run_of(change: dict[str, Any], folder: Path) -> Path:
     run = trained(folder / "seed-0")
     config = json.loads(run.config_path.read_text()) | {"env_spec": json.dumps(POLE | change)}
     run.config_path.write_text(json.dumps(config))
-    uniform(np.array([-3.0], np.float32), np.array([3.0], np.float32), 4, "").save(run.policy_path)
+    uniform_policy(np.array([-3.0], np.float32), np.array([3.0], np.float32), 4, "").save(run.policy_path)
     return run.folder
 
 

@@ -14,7 +14,7 @@ from stable_baselines3 import SAC
 
 from offbench.agents.sac import export_actor
 from offbench.common.errors import OffbenchError
-from offbench.rollouts.policy import Policy, from_bytes, load_policy, uniform
+from offbench.rollouts.policy import Policy, from_bytes, read_policy_file, uniform_policy
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_observations_are_normalized() -> None:
 
 def test_uniform_covers_the_bounds(rng: np.random.Generator) -> None:
     low, high = np.array([-2.0], np.float32), np.array([6.0], np.float32)
-    policy = uniform(low, high, 4, "X-v0")
+    policy = uniform_policy(low, high, 4, "X-v0")
     actions = policy.act(np.zeros((20_000, 4)), policy.draw(rng, 20_000))
     assert actions.min() >= -2
     assert actions.max() <= 6
@@ -76,7 +76,7 @@ def test_uniform_covers_the_bounds(rng: np.random.Generator) -> None:
 def test_a_file_comes_back_the_same(sac: SAC, home: Path, rng: np.random.Generator) -> None:
     policy = export_actor(sac, "Hopper-v5", {"algorithm": "SAC", "step": 7})
     policy.save(home / "p.safetensors")
-    again = load_policy(home / "p.safetensors")
+    again = read_policy_file(home / "p.safetensors")
     observations = rng.normal(size=(5, 11))
     np.testing.assert_array_equal(again.act(observations, None), policy.act(observations, None))
     assert again.origin == policy.origin
@@ -116,4 +116,4 @@ def test_damaged_files_are_refused(sac: SAC, home: Path, kind: str) -> None:
     from_bytes(path.read_bytes())
     _damage(kind, path)
     with pytest.raises(OffbenchError, match="not a readable policy file"):
-        load_policy(path)
+        read_policy_file(path)

@@ -27,7 +27,7 @@ from offbench.common.seeds import Purpose
 from offbench.data import minari_store
 from offbench.data.recording import cut_at
 from offbench.envs.environments import env_spec, make_env
-from offbench.rollouts.policy import uniform
+from offbench.rollouts.policy import uniform_policy
 from offbench.rollouts.rollouts import (
     PARALLEL_EPISODES,
     Episode,
@@ -80,7 +80,7 @@ def plain(env_id: str) -> gym.Env:
 
 def test_an_episode_equals_one_played_by_hand_with_gymnasium() -> None:
     """Episode 11 of a task of 20, replayed alone in an environment of its own from its seeds."""
-    spec, policy = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5")
+    spec, policy = env_spec("Hopper-v5"), uniform_policy(*BOUNDS, 11, "Hopper-v5")
     episodes = play(EpisodeTask(spec, policy.to_bytes(), 5, (2,), tuple(range(20)), False))
     episode = episodes[11]
     assert isinstance(episode, Episode)
@@ -98,7 +98,7 @@ def test_an_episode_equals_one_played_by_hand_with_gymnasium() -> None:
 
 
 def test_more_episodes_than_lanes_keep_their_order() -> None:
-    spec, policy = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5")
+    spec, policy = env_spec("Hopper-v5"), uniform_policy(*BOUNDS, 11, "Hopper-v5")
     indices = tuple(range(PARALLEL_EPISODES * 2 + 3))
     together = play(EpisodeTask(spec, policy.to_bytes(), 0, (), indices, False))
     for index in indices[::5]:
@@ -141,7 +141,7 @@ def test_a_walker_works_out_once_a_step_whether_it_is_healthy(monkeypatch: pytes
 def test_no_more_episodes_are_played_than_are_likely_to_be_wanted(
     workers: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spec, policy, enough = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5"), 8000
+    spec, policy, enough = env_spec("Hopper-v5"), uniform_policy(*BOUNDS, 11, "Hopper-v5"), 8000
     begun: list[int] = []
     call = Rollouts.call
     monkeypatch.setattr(Rollouts, "call", lambda self, do, task: begun.extend(task.indices) or call(self, do, task))
@@ -159,7 +159,7 @@ def test_no_more_episodes_are_played_than_are_likely_to_be_wanted(
 
 
 def test_the_last_episode_is_cut_and_truncated() -> None:
-    spec, policy = env_spec("Hopper-v5"), uniform(*BOUNDS, 11, "Hopper-v5")
+    spec, policy = env_spec("Hopper-v5"), uniform_policy(*BOUNDS, 11, "Hopper-v5")
     with Rollouts(spec) as rollouts:
         whole = list(itertools.islice(rollouts.episodes(policy, 0), 8))
         total = sum(map(len, whole[:3])) + 1
@@ -173,7 +173,7 @@ def test_the_last_episode_is_cut_and_truncated() -> None:
 
 def test_sigterm_to_all_processes_leaves_evaluations_to_the_parent() -> None:
     """Slurm sends it so; the parent saves a checkpoint, and that waits for the evaluations under way."""
-    policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
+    policy = uniform_policy(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     with Rollouts(POLE, workers=2) as rollouts:
         gather(rollouts.start_evaluation(policy, 0, (), 1, True))
         futures = rollouts.start_evaluation(policy, 0, (), 400, False)
@@ -184,7 +184,7 @@ def test_sigterm_to_all_processes_leaves_evaluations_to_the_parent() -> None:
 
 
 def test_a_killed_worker_ends_those_beside_it() -> None:
-    policy = uniform(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
+    policy = uniform_policy(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "InvertedPendulum-v5")
     with Rollouts(POLE, workers=2) as rollouts:
         gather(rollouts.start_evaluation(policy, 0, (), 100, False))
         assert rollouts._pool is not None
@@ -199,7 +199,7 @@ def test_a_killed_worker_ends_those_beside_it() -> None:
 
 
 def test_leaving_the_pool_ends_what_is_being_played() -> None:
-    policy = uniform(*BOUNDS, 11, "Hopper-v5")
+    policy = uniform_policy(*BOUNDS, 11, "Hopper-v5")
     with Rollouts(env_spec("Hopper-v5"), workers=1) as rollouts:
         assert len(gather(rollouts.start_evaluation(policy, 0, (), 1, False))) == 1
         many = EpisodeTask(rollouts.env_spec, policy.to_bytes(), 0, (), tuple(range(10**6)), False)

@@ -17,7 +17,7 @@ import offbench
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.common.provenance import hardware
-from offbench.rollouts.policy import load_policy
+from offbench.rollouts.policy import read_policy_file
 from offbench.training.run import find_runs
 from tests.conftest import ROOT
 
@@ -43,7 +43,10 @@ def test_an_earlier_run_resumes_with_the_same_bits(algorithm: str, home: Path) -
     config = json.loads((run / "config.json").read_text())
     before = json.loads((EARLIER / "runs" / run.relative_to("runs") / "config.json").read_text())
     assert config["settings"] == before["settings"]
-    now, then = load_policy(run / "policy.safetensors"), load_policy(EARLIER / "after" / f"{algorithm}.safetensors")
+    now, then = (
+        read_policy_file(run / "policy.safetensors"),
+        read_policy_file(EARLIER / "after" / f"{algorithm}.safetensors"),
+    )
     losses = (run / "losses.csv").read_text()
     same = all(hardware()[key] == before["hardware"][key] for key in ("processor", "vectors"))
     for ours, theirs in zip(now.layers, then.layers, strict=True):

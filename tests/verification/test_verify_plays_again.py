@@ -112,7 +112,7 @@ def test_another_version_is_compared_within_a_tolerance_and_said(hopper: str) ->
     change_metadata(hopper, versions=versions() | {"mujoco": "3.2.3"})
     report = verify(hopper, workers=1)
     assert report.ok
-    assert "recorded with mujoco 3.2.3, installed is" in report.warnings[0]
+    assert "recorded with mujoco 3.2.3, but" in report.warnings[0]
 
     def edit(file: h5py.File) -> None:
         for group in each(file):
