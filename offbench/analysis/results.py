@@ -234,7 +234,7 @@ def entries_of(
         compared: whether the runs are compared, so that those on the same data must have been evaluated alike.
 
     Raises:
-        OffbenchError: one is duplicated, two are not comparable, none but damaged ones is evaluated, or there is no such
+        OffbenchError: one is duplicated, two are not comparable, all evaluated ones are damaged, or there is no such
             dataset.
     """
     groups: dict[tuple[str, str, str, str], list[EvaluatedRun]] = {}

@@ -56,9 +56,13 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-@functools.cache
 def fields(cls: type) -> Mapping[str, Field]:
     """Return the fields of a settings class that a user may set, by name."""
+    return _fields(cls)
+
+
+@functools.cache  # not on `fields`: mypy would refuse type[T] as a key
+def _fields(cls: type) -> Mapping[str, Field]:
     return {f.name: f for f in dataclasses.fields(cls) if not f.metadata.get("internal")}
 
 

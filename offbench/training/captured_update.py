@@ -115,8 +115,8 @@ class CapturedUpdate:
         if reason and done > TRACED_UPDATES:
             name = type(self.algorithm).__name__
             raise OffbenchError(
-                f"{name}.update {reason} after {done:,} updates; return different phases for updates that differ, or set "
-                f"`capture = False` in class {name}"
+                f"{name}.update {reason} after {done:,} updates; return different phases for updates that differ, or "
+                f"set `capture = False` in class {name}"
             )
         if reason:
             self._run_eagerly(reason)

@@ -42,7 +42,8 @@ def check_datasets(datasets: Datasets) -> None:
                 report_margin_rule(name, data.metadata, data.env_spec)
                 if changed := describe_changes(recorded.env_code, environment_code(data.env_spec)):
                     warn(
-                        f"{name} was recorded in other code of its environment: {changed}; scores may not be comparable"
+                        f"{name} was recorded in other code of its environment: {changed}; scores may not be "
+                        "comparable"
                     )
             warn_other_physics(name, recorded.versions, data.env_spec)
         else:
