@@ -145,7 +145,7 @@ def test_runs_of_different_settings_in_one_variant_are_said(home: Path, capsys: 
         ("td3bc", "bdb/beta=0.5", "unknown method 'td3bc': did you mean 'td3_bc'?"),
         ("td3_bc", "bdb", "bdb has several variants: give one of 'bdb (beta=0.5)', 'bdb (beta=0.75)'"),
         ("td3_bc", "bdb/beta=0.55", "no method 'bdb/beta=0.55' here: did you mean 'bdb (beta=0.5)'?"),
-        ("td3_bc", "td3_bc/default", "are the same runs"),
+        ("td3_bc", "td3_bc/default", "are the same method"),
         ("td3_bc", "cql", "share no dataset with a seed in common"),
         ("td3_bc", "bc", "raw returns, which do not average"),
     ],
