@@ -13,6 +13,7 @@ Ctrl-C and SIGTERM save a checkpoint at once; a resume from it ends with the sam
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -20,7 +21,7 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -129,12 +130,21 @@ def _flattened(table: JsonObject) -> JsonObject:
     return inner | {key: value for key, value in table.items() if not isinstance(value, dict)}
 
 
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 def _train(folder: TrainingFolder, steps: int) -> None:
     """Train segment after segment, until `steps`, Ctrl-C or SIGTERM."""
     recipe, settings = folder.recipe, folder.recipe.sac
-    torch.set_num_threads(1)
     title, spec = f"SAC on {recipe.name}", recipe.env_spec()
-    with collect_stop_signals(second_at_once=True) as stops, Rollouts(spec) as rollouts:
+    with _one_thread(), collect_stop_signals(second_at_once=True) as stops, Rollouts(spec) as rollouts:
         step_seconds = _measure_gradient_step(recipe, spec)  # draws from the generators that a checkpoint restores
         model = _make_sac(recipe, spec, steps + settings.segment)
         seconds = _start_or_resume(folder, model)

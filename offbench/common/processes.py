@@ -20,7 +20,7 @@ from offbench.common.interrupts import STOP_SIGNALS, delay_stop_signals
 if TYPE_CHECKING:
     from ctypes import c_byte
 
-MAX_WORKERS = 1_000
+MAX_WORKERS = 61 if sys.platform == "win32" else 1_000  # Windows waits for 61 processes at most
 GRACE = 2.0  # seconds that a worker has to end when its pool closes
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -52,17 +52,22 @@ def cores() -> int:
 def default_workers(workers: int | None) -> int:
     """Return `workers`, or one per core if it is None. Raises OffbenchError below 1 or above MAX_WORKERS."""
     if workers is None:
-        return cores()
+        return min(cores(), MAX_WORKERS)
     if not 1 <= workers <= MAX_WORKERS:
         raise OffbenchError(f"workers must be from 1 to {MAX_WORKERS:,}, not {workers}")
     return workers
 
 
 @contextlib.contextmanager
-def start_errors() -> Iterator[None]:
-    """Convert the operating system's errors while starting a process, or sharing memory, into an error of one line."""
+def process_start() -> Iterator[None]:
+    """Start a process, or what it needs, such as shared memory.
+
+    The operating system's errors are converted into an error of one line. Python must not import from the working
+    directory: it may hold files that were handed over, and a process that starts with `-c` has it on its path.
+    """
     try:
-        yield
+        with environment({"PYTHONSAFEPATH": "1"}):
+            yield
     except OSError as error:
         full = error.errno == errno.ENOSPC
         remedy = OPEN_FILES.get(error.errno, "free some space in /dev/shm" if full else "use fewer --workers")
@@ -79,7 +84,7 @@ def uninterrupted_start() -> Iterator[None]:
     """
     script = sys.modules["__main__"]
     threads = {name: "1" for name in THREADS if name not in os.environ}
-    with start_errors(), delay_stop_signals(), environment(threads):
+    with process_start(), delay_stop_signals(), environment(threads):
         sys.modules["__main__"] = types.ModuleType("__main__")
         try:
             yield

@@ -16,9 +16,8 @@ from offbench.envs.environments import Env, untrusted_env
 from offbench.envs.margin_rule import MAX_RULE, MUJOCO_VERSIONS, SUM_RULE, with_margin
 from offbench.envs.recipes import load_recipe, shipped_recipes
 
-CLAUSE = re.compile(
-    r"(==|~=|<=|>=|<|>)\s*(\d{1,6})(?:\.(\d{1,6}))?"
-)  # a clause of a requirement: `>=3.1.0,<3.2.0` has two
+# a clause of a requirement: `>=3.1.0,<3.2.0` has two
+CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d{1,6})(?:\.(\d{1,6}))?")
 
 
 def make_env(name: str | Path, render_mode: str | None = None) -> Env:
@@ -78,20 +77,14 @@ def recorded_mujoco(metadata: JsonObject) -> str | None:
     return next((match[1] for match in pinned if match), None)
 
 
-def margins_matter(env_spec: str) -> bool:
-    """Return whether the rule for contact margins makes a difference in an environment (EnvSpec JSON)."""
-    from offbench.envs.contact_margins import has_margins, model_of  # imports MuJoCo, which is slow to load
-
-    env = environments.make_env(env_spec)
-    model = model_of(env)
-    env.close()
-    return model is not None and has_margins(model)
-
-
 def report_margin_rule(dataset_id: str, metadata: JsonObject, env_spec: str) -> None:
     """Print the contact-margin rule of a dataset's environment (EnvSpec JSON), unless it is the default or unused."""
     rule = recorded_margin(metadata)
-    if rule == MAX_RULE or not margins_matter(env_spec):
+    if rule == MAX_RULE:
+        return
+    from offbench.envs.contact_margins import margins_matter  # imports MuJoCo, which is slow to load
+
+    if not margins_matter(env_spec):
         return
     since, installed = MUJOCO_VERSIONS[rule or MAX_RULE], versions()["mujoco"]
     message = f"{dataset_id}: contact margins as in MuJoCo {since} ({installed} is installed)"

@@ -55,7 +55,7 @@ class Recording:
         accept: bool,
     ) -> None:
         self.recipe, self.parts, self._ladder, self.seed = recipe, parts, ladder, seed
-        self.workers = workers if workers > 1 else 0  # a single one would be no faster than this process
+        self.workers = workers
         self.env_spec = recipe.env_spec()
         env = make_env(self.env_spec)
         model = model_of(env)

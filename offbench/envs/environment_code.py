@@ -7,7 +7,7 @@ import importlib
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from offbench.common.code_hash import module_code, package_versions
@@ -27,10 +27,20 @@ def environment_code(env_spec: str) -> dict[str, str]:
         module, _, name = str(part["entry_point"]).partition(":")
         if module.partition(".")[0] not in LEFT_OUT:
             hashes |= _code(getattr(importlib.import_module(module), name))
-        for value in (part.get("kwargs") or {}).values():
-            if isinstance(value, str) and os.path.isfile(value):
-                hashes[os.path.basename(value)] = sha256(Path(value).read_bytes())
+        for argument, path in _files("", part.get("kwargs") or {}):
+            name = os.path.basename(path)
+            name = f"{name} ({argument})" if name in hashes else name
+            hashes[name] = sha256(Path(path).read_bytes())
     return dict(sorted(hashes.items()))
+
+
+def _files(name: str, value: object) -> Iterator[tuple[str, str]]:
+    """Yield the files that an argument names, each with the argument's name: `scene`, `assets.0`."""
+    if isinstance(value, str) and os.path.isfile(value):
+        yield name, value
+    elif isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _files(f"{name}.{key}".lstrip("."), item)
 
 
 @functools.cache  # cached at import: its files may change later

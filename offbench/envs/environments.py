@@ -34,6 +34,7 @@ RENDERING_ARGUMENTS = {"render_mode", "width", "height", "camera_id", "camera_na
 MAX_ACTION_BOUND = 1e6  # larger bounds, such as float32's maximum, count as none
 MAX_EPISODE_STEPS = 20_000  # steps that an episode may take in an environment without a time limit
 MAX_TIME_LIMIT = 1_000_000  # a larger time limit counts as none
+STATEFUL_WRAPPERS = {"NormalizeObservation", "NormalizeReward"}
 OTHER_ENV = "give the right environment with --env RECIPE"
 
 
@@ -55,7 +56,7 @@ def env_spec(env_id: str, **kwargs: Any) -> str:
         if isinstance(error, gym.error.NameNotFound | gym.error.NamespaceNotFound) and ":" not in env_id:
             hint = f". If a module of yours registers it, name it before a colon: my_module:{env_id}"
         raise OffbenchError(f"cannot make the environment {env_id!r}: {reason(error).rstrip('.')}{hint}") from error
-    _check_importable(env.spec)
+    _check_repeatable(env.spec)
     spaces_of(env, env_id)
     _warn_no_time_limit(env_id, env.spec)
     return text
@@ -66,11 +67,16 @@ def parse_spec(text: str) -> EnvSpec:
     return EnvSpec.from_json(without_margin(text)[0])
 
 
-def check_spec(text: str, where: str, observation_dim: int, low: Array, high: Array) -> None:
+def check_spec(
+    text: str, where: str, observation_dim: int, low: Array, high: Array, *, from_recipe: bool = False
+) -> None:
     """Check that the EnvSpec JSON of a file can be trusted and made, and has the file's shapes.
 
     Warns on stderr if the environment takes actions within other bounds than `low` and `high`, [act] each, or may
     never end.
+
+    Args:
+        from_recipe: whether the EnvSpec is of the user's own recipe, which may name any code.
 
     Raises:
         OffbenchError: it names code that is no Gymnasium environment, cannot be made, or has other shapes.
@@ -79,7 +85,7 @@ def check_spec(text: str, where: str, observation_dim: int, low: Array, high: Ar
         spec = parse_spec(text)
         _warn_no_time_limit(spec.id, spec)
     try:
-        env = untrusted_env(text, where)
+        env = make_env(text) if from_recipe else untrusted_env(text, where)
         observations, actions = spaces_of(env, where)
     except OffbenchError as error:
         raise OffbenchError(f"{error}; to evaluate in another environment, {OTHER_ENV}") from error
@@ -116,7 +122,7 @@ def untrusted_env(text: str, where: str) -> Env:
     """
     try:
         spec = parse_spec(text)
-        _check_importable(spec)
+        _check_repeatable(spec)
         for wrapper in spec.additional_wrappers:
             if wrapper.kwargs is None:
                 raise OffbenchError(
@@ -139,10 +145,17 @@ def untrusted_env(text: str, where: str) -> Env:
         ) from error
 
 
-def _check_importable(spec: EnvSpec | None) -> None:
-    """Refuse an environment that is defined in the script itself: worker processes cannot import it."""
-    points = [spec.entry_point, *(wrapper.entry_point for wrapper in spec.additional_wrappers)] if spec else []
-    if spec and any(str(point).startswith("__main__:") for point in points):
+def _check_repeatable(spec: EnvSpec | None) -> None:
+    """Refuse an environment that worker processes cannot import, or whose episodes depend on earlier episodes."""
+    wrappers = spec.additional_wrappers if spec else ()
+    points = [str(item.entry_point) for item in (spec, *wrappers) if item]
+    for wrapper in wrappers:
+        if wrapper.name in STATEFUL_WRAPPERS:
+            raise OffbenchError(
+                f"the environment has the wrapper {wrapper.name}, whose statistics carry over from one episode to the "
+                "next: results would depend on the order of the episodes; use the environment without it"
+            )
+    if spec and any(point.startswith("__main__:") for point in points):
         raise OffbenchError(
             f"the environment {spec.id} is defined in the script itself (__main__), where worker processes cannot "
             "import it; move it into a module and register it there"

@@ -22,7 +22,7 @@ from offbench.common.files import read_errors, read_text
 from offbench.common.scores import are_references
 from offbench.common.settings import build, setting, short_repr
 from offbench.envs.environments import PASSIVE_WRAPPERS, RENDERING_ARGUMENTS, env_spec
-from offbench.envs.margin_rule import MAX_RULE, SUM_RULE, with_margin
+from offbench.envs.margin_rule import MARGIN_KEY, MAX_RULE, SUM_RULE, with_margin
 
 T = TypeVar("T")
 
@@ -175,8 +175,11 @@ def _kwargs(value: object, where: str) -> tuple[tuple[str, object], ...]:
 
 
 def _check(recipe: Recipe, where: str) -> None:
-    if not recipe.name.replace("-", "").replace("_", "").isalnum():
-        raise OffbenchError(f"{where}: name may hold letters, digits, - and _ only, not {recipe.name!r}")
+    if not recipe.name.replace("-", "").replace("_", "").isalnum() or not recipe.name[0].isalnum():
+        raise OffbenchError(
+            f"{where}: name must begin with a letter or digit and have letters, digits, - and _ only, not "
+            f"{recipe.name!r}"
+        )
     if (recipe.d4rl_min is None) != (recipe.d4rl_max is None):
         raise OffbenchError(f"{where}: give both d4rl_min and d4rl_max, or neither")
     low, high = recipe.d4rl_min, recipe.d4rl_max
@@ -209,7 +212,7 @@ def d4rl_reference_of_env(env_spec: str | None) -> tuple[float, float] | None:
     """Return D4RL's reference returns (random, expert) of an environment (EnvSpec JSON).
 
     They hold for the standard task alone (its versions v2 to v5): None for any other environment, and where arguments,
-    time limit or wrappers are not the standard ones.
+    time limit, wrappers or contact margins are not the standard ones.
     """
     fields = json.loads(env_spec or "{}")
     recipe = _shipped_recipe(str(fields.get("id")))
@@ -222,4 +225,8 @@ def d4rl_reference_of_env(env_spec: str | None) -> tuple[float, float] | None:
         and not (fields.get("kwargs") or {}).keys() - RENDERING_ARGUMENTS
         and wrappers <= PASSIVE_WRAPPERS
     )
+    if standard and fields.get(MARGIN_KEY) == SUM_RULE:
+        from offbench.envs.contact_margins import margins_matter  # imports MuJoCo, which is slow to load
+
+        standard = not margins_matter(str(env_spec))
     return (recipe.d4rl_min, recipe.d4rl_max) if standard else None

@@ -38,8 +38,6 @@ WRAPPERS = {
     "FlattenObservation",
     "FrameStackObservation",
     "MaxAndSkipObservation",
-    "NormalizeObservation",
-    "NormalizeReward",
     "OrderEnforcing",
     "PassiveEnvChecker",
     "RecordEpisodeStatistics",
@@ -68,7 +66,7 @@ def trusting() -> Iterator[None]:
 
 def is_trusting() -> bool:
     """Return whether the user trusts the files of this command (--trust)."""
-    return os.environ.get(VARIABLE, "") not in ("", "0")
+    return os.environ.get(VARIABLE) == "1"
 
 
 def check_code(spec: EnvSpec) -> None:
@@ -161,8 +159,10 @@ class _ArgumentChecker:
             for item in value:
                 self.check(item, where, depth + 1)
         elif isinstance(value, str):
-            if len(value) > MAX_TEXT_LENGTH or re.search(r"[/\\\0]", value) or value.startswith((".", "~")):
-                raise OffbenchError(f"{where} hold {value[:MAX_TEXT_LENGTH]!r}, which may lead to a file; {REMEDY}")
+            if len(value) > MAX_TEXT_LENGTH or re.search(r"[/\\:\0]", value) or value.startswith((".", "~")):
+                raise OffbenchError(
+                    f"{where} hold {value[:MAX_TEXT_LENGTH]!r}, which may lead to a file or module; {REMEDY}"
+                )
         elif isinstance(value, int):
             if abs(value) > MAX_ARGUMENT:
                 raise OffbenchError(

@@ -87,8 +87,7 @@ def evaluate(
     policy, config, spec = open_policy(path, env)
     if stochastic and not policy.stochastic:
         raise OffbenchError(f"{path} is a deterministic policy; leave out --stochastic")
-    workers = default_workers(workers)
-    with Rollouts(spec, workers if workers > 1 else 0) as rollouts:
+    with Rollouts(spec, default_workers(workers)) as rollouts:
         episode_stats = rollouts.evaluate(policy, seed, (int(Purpose.REFERENCE), 2), episodes, not stochastic)
     returns = [episode.ret for episode in episode_stats]
     env_id = json.loads(spec)["id"]
@@ -120,7 +119,9 @@ def _registered(env_id: str, path: Path) -> str:
 
 
 def open_policy(path: Path, env: str | Path | None = None) -> tuple[Policy, RunConfig | None, str]:
-    """Return the policy of a run's folder or a policy file, the run's config (None for a file) and its EnvSpec.
+    """Return the policy of a run's folder or a policy file, the run's config and the policy's EnvSpec.
+
+    The config is None for a policy file that is not in a run's folder.
 
     Args:
         env: a recipe's name or file, instead of the environment that the run or policy names.
@@ -128,10 +129,9 @@ def open_policy(path: Path, env: str | Path | None = None) -> tuple[Policy, RunC
     Raises:
         OffbenchError: there is no run or policy, or it does not fit the environment.
     """
-    config = None
-    if path.is_dir():
-        config = Run(path).config()
-    policy = load_policy(path)
+    policy, run = load_policy(path), Run(path if path.is_dir() else path.parent)
+    of_run = path.is_dir() or (path == run.policy_path and run.config_path.exists())
+    config = run.config() if of_run else None
     if env is not None:
         spec = load_recipe(env).env_spec()
     elif config is not None and config.env_spec is not None:
@@ -140,7 +140,8 @@ def open_policy(path: Path, env: str | Path | None = None) -> tuple[Policy, RunC
         spec = env_spec(_registered(policy.env_id, path))
     else:
         raise OffbenchError(f"{path} names no environment; give one with --env")
-    check_spec(spec, str(path), len(policy.observation_mean), policy.low, policy.high)
+    dim = len(policy.observation_mean)
+    check_spec(spec, str(path), dim, policy.low, policy.high, from_recipe=env is not None)
     if env is None and config and (changed := describe_changes(config.env_code, environment_code(spec))):
         warn(f"the code of {path}'s environment has changed since it was trained: {changed}")
     return policy, config, spec

@@ -11,12 +11,14 @@ from collections.abc import Iterator
 
 from offbench.common.processes import environment
 
-BACKENDS = ("egl", "osmesa")
+BACKENDS = ("egl", "osmesa") if sys.platform == "linux" else ("glfw",)  # MuJoCo has no others there
 KEY = "MUJOCO_GL"
 TIMEOUT = 60  # seconds that a probe may take
 NO_RENDERER = (
     "MuJoCo cannot render: neither EGL nor OSMesa works; install one of them, e.g. `apt-get install libegl1 "
     "libgl1-mesa-dri` or `apt-get install libosmesa6` (conda: mesalib)"
+    if sys.platform == "linux"
+    else "MuJoCo cannot render: GLFW does not work; run the command in a session with a screen"
 )
 PROBE = """
 import mujoco
@@ -43,7 +45,7 @@ def _renders(backend: str) -> bool:
     variables = {key: value for key, value in os.environ.items() if key != "PYOPENGL_PLATFORM"} | {KEY: backend}
     try:
         done = subprocess.run(
-            [sys.executable, "-c", PROBE], env=variables, capture_output=True, timeout=TIMEOUT, check=False
+            [sys.executable, "-P", "-c", PROBE], env=variables, capture_output=True, timeout=TIMEOUT, check=False
         )
     except subprocess.TimeoutExpired:
         return False

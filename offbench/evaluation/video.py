@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import json
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterator
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
 
 ENDINGS = (".gif", ".mp4")
 COLORS = 64  # colors of a GIF
+MAX_GIF_FPS = 50  # browsers show frames that take less than 0.02 s more slowly
 STREAM = (int(Purpose.REFERENCE), 3)  # other episodes than those of any measurement
 
 
@@ -72,8 +75,8 @@ def video(
     target, seed = output_file(out), check_seed(seed)
     if target.suffix.lower() not in ENDINGS:
         raise OffbenchError(f"a video's name must end in {' or '.join(ENDINGS)}, not {target.name!r}")
-    if min(episodes, fps, size) < 1 or (seconds is not None and seconds <= 0):
-        raise OffbenchError("episodes, seconds, fps and size must be more than 0")
+    if min(episodes, fps, size) < 1 or (seconds is not None and not 0 < seconds < math.inf):
+        raise OffbenchError("episodes, seconds, fps and size must be more than 0, and finite")
     encode = _gif if target.suffix.lower() == ".gif" else _encoder()
     backend = working_backend()
     with contextlib.ExitStack() as drawing:
@@ -84,6 +87,8 @@ def video(
             raise OffbenchError(f"{json.loads(spec)['id']} has no time limit (max_episode_steps); give --seconds")
         rate = float(world.metadata.get("render_fps") or fps)
         frame_interval = max(1, round(rate / fps))
+        if encode is _gif:
+            frame_interval = max(frame_interval, math.ceil(rate / MAX_GIF_FPS))
         max_steps = seconds * rate if seconds else float("inf")
         encode(
             target,
@@ -194,8 +199,10 @@ def _frame(env: Env, step: int, total: float, size: int) -> Image:
 def _gif(path: Path, frames: Iterator[Image], fps: float) -> None:
     first, *rest = [frame.quantize(COLORS) for frame in frames]
     data = io.BytesIO()
-    # a GIF counts in hundredths of a second
-    first.save(data, "GIF", save_all=True, append_images=rest, duration=round(100 / fps) * 10, loop=0, optimize=True)
+    # a GIF counts in hundredths of a second: durations differ, so that rounding does not add up
+    ends = [round(100 * index / fps) for index in range(len(rest) + 2)]
+    durations = [10 * (end - start) for start, end in itertools.pairwise(ends)]
+    first.save(data, "GIF", save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)
     write_bytes(path, data.getvalue())
 
 
@@ -207,11 +214,19 @@ def _encoder() -> Callable[[Path, Iterator[Image], float], None]:
             "mp4 needs imageio-ffmpeg: `pip install 'offbench[video]'`, or give --out video.gif"
         ) from None
 
+    def check_frames(video: Path, expected: int) -> None:
+        try:
+            written, _ = imageio_ffmpeg.count_frames_and_secs(str(video))
+        except (RuntimeError, ValueError):  # no video that ffmpeg can read
+            written = 0
+        if written != expected:
+            raise OSError(f"the encoder wrote {written} of {expected} frames; is the disk full?")
+
     def mp4(path: Path, frames: Iterator[Image], fps: float) -> None:
         temporary = path.with_name(f".{path.stem}.{os.getpid()}.mp4")
         with write_errors(str(path)):
             try:
-                first = next(frames)
+                first, count = next(frames), 1
                 writer = imageio_ffmpeg.write_frames(
                     str(temporary), first.size, fps=fps, macro_block_size=2, quality=7
                 )
@@ -219,7 +234,9 @@ def _encoder() -> Callable[[Path, Iterator[Image], float], None]:
                 writer.send(first.tobytes())
                 for frame in frames:
                     writer.send(frame.tobytes())
+                    count += 1
                 writer.close()
+                check_frames(temporary, count)
                 temporary.replace(path)
             finally:
                 temporary.unlink(missing_ok=True)

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from offbench.common import seeds
 from offbench.common.arrays import Array
 from offbench.common.errors import SHOW_TRACEBACK, OffbenchError
-from offbench.common.processes import closing, start_errors, start_worker, uninterrupted_start
+from offbench.common.processes import closing, process_start, start_worker, uninterrupted_start
 from offbench.common.scores import interval
 from offbench.common.seeds import Purpose
 from offbench.envs.environments import MAX_EPISODE_STEPS, Env, box, make_env, reason, time_limit
@@ -287,17 +287,18 @@ def cached_envs(env_spec: str, count: int) -> list[Env]:
 
 
 class Rollouts:
-    """Plays episodes of one environment, in this process (workers = 0) or in a pool of worker processes.
+    """Plays episodes of one environment, in this process (workers = 0 or 1) or in a pool of worker processes.
 
     Use as a context manager. Results do not depend on `workers`. A FunctionPolicy needs workers = 0.
     """
 
     def __init__(self, env_spec: str, workers: int = 0) -> None:
+        workers = workers if workers > 1 else 0  # a single one would be no faster than this process
         self.env_spec, self.workers = env_spec, workers
         self._pool: ProcessPoolExecutor | None = None
         if workers:
             context = multiprocessing.get_context("spawn")
-            with start_errors():
+            with process_start():
                 self._closing = context.RawValue("b", 0)  # no lock, which a killed worker could hold for ever
                 self._pool = ProcessPoolExecutor(workers, context, start_worker, (os.getpid(), self._closing))
 

@@ -196,7 +196,7 @@ def _renderer() -> Iterator[tuple[str, str]]:
 
 def _extras() -> Iterator[tuple[str, str]]:
     for module, purpose in EXTRAS.items():
-        if importlib.util.find_spec(module):
+        try:
             yield OK, f"{module} {importlib.metadata.version(module)}"
-        else:
+        except importlib.metadata.PackageNotFoundError:
             yield NOTE, f"{module} is not installed ({purpose})"

@@ -36,9 +36,11 @@ def check_datasets(datasets: Datasets) -> None:
     """
     for name, data in datasets.items():
         if data.env_spec:
-            check_spec(data.env_spec, name, data.observations.shape[1], data.low, data.high)
+            from_recipe = data.evaluated_in is not None
+            shape = data.observations.shape[1]
+            check_spec(data.env_spec, name, shape, data.low, data.high, from_recipe=from_recipe)
             recorded = read_provenance(data.metadata)
-            if data.evaluated_in is None:
+            if not from_recipe:
                 report_margin_rule(name, data.metadata, data.env_spec)
                 if changed := describe_changes(recorded.env_code, environment_code(data.env_spec)):
                     warn(

@@ -33,7 +33,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "repeated-seeds": ("several episodes were reset with the same seed", "give every episode its own"),
     "wrong-seeds": ("seeds are not those of the recorded seed and part", RECORD_AGAIN),
     "content-hash": ("the arrays are not those that were recorded", RECORD_AGAIN),
-    "metadata": ("what the metadata say of the recording is damaged", RECORD_AGAIN),
+    "metadata": ("the metadata about the recording is damaged", RECORD_AGAIN),
     "parts": ("the recorded parts do not end where episodes end", RECORD_AGAIN),
     "wrong-level": (
         "a part's mean return is not the one measured for its level: levels swapped, or other data",
@@ -50,6 +50,7 @@ FAULTS: dict[str, tuple[str, str]] = {
         "the environment moves differently from what was recorded",
         "use the simulator and the env_spec it was recorded with",
     ),
+    "not-replayable": ("the environment fails when the episode is played again", "correct the data or the env_spec"),
     "other-rewards": ("the environment gives other rewards", "correct the rewards or the env_spec's kwargs"),
     "timeouts-as-terminations": (
         "marked as terminated where the environment does not terminate: bootstrapping stops wrongly",

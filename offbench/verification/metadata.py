@@ -98,9 +98,9 @@ def _check_part(
                 out.add("wrong-seeds", f"episode {i}")
     if "return" not in part:
         return
-    complete = [
-        scanned.returns[i] for i in chosen if scanned.ended[i][0] or limit is None or scanned.lengths[i] == limit
-    ]
+    last = chosen[-1]  # the only episode of a part that may be cut short
+    whole = scanned.ended[last][0] or scanned.lengths[last] == limit
+    complete = [scanned.returns[i] for i in (chosen if whole else chosen[:-1])]
     if not complete or not np.isfinite(complete).all():
         return
     count = int(part.get("episodes") or provenance.references["random"]["episodes"])

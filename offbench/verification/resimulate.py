@@ -16,11 +16,12 @@ import gymnasium as gym
 import numpy as np
 
 from offbench.common.arrays import Array
+from offbench.common.errors import OffbenchError
 from offbench.data.minari_reader import RecordedEpisode
 from offbench.envs.environments import Env, box
 from offbench.rollouts.rollouts import cached_envs, reset, step
 
-STEPS = 40  # most steps of an episode that are replayed one at a time
+STEPS = 40  # maximum number of steps of an episode that are replayed one at a time
 WHOLE, CLOSE, ROUNDED = 1e-9, 1e-6, 1e-4  # tolerances: same physics, other version, observations kept as float32
 CLIPPED_VELOCITY = 10.0  # Hopper and Walker2d report no velocity beyond it: the state cannot be recovered there
 SHARE = 0.01  # share of the replayed steps that may differ (at least one): rounding can change a contact or a limit
@@ -37,6 +38,11 @@ class ReplayResult:
     end: bool = True  # whether its last step was played, so that its end is checked
     rounding: bool = False  # whether a replay from the seed differs, at first in the last bits only
 
+    @property
+    def checks_end(self) -> bool:
+        """Whether the environment ends the episode as recorded."""
+        return self.how != "none" and self.end and not self.faults
+
 
 def replay_episode(env_spec: str, episode: RecordedEpisode, exact: bool, last_unknown: bool) -> ReplayResult:
     """Replay one episode by the strictest method that it allows.
@@ -47,13 +53,20 @@ def replay_episode(env_spec: str, episode: RecordedEpisode, exact: bool, last_un
         last_unknown: a terminated episode's last observation is a placeholder, as after an import from D4RL.
     """
     env = cached_envs(env_spec, 1)[0]
+    try:
+        return _replay_episode(env, episode, exact, last_unknown)
+    except OffbenchError as error:  # the environment failed
+        return ReplayResult(episode.index, "none", 0, (("not-replayable", str(error)),))
+
+
+def _replay_episode(env: Env, episode: RecordedEpisode, exact: bool, last_unknown: bool) -> ReplayResult:
     if episode.seed is not None and exact and not last_unknown:
         from_seed = _from_seed(env, episode, 0.0)
-        if not from_seed.rounding:
+        if from_seed.how == "seed":
             return from_seed
         state = _StateSetter.of(env)
         if state is None:
-            return ReplayResult(episode.index, "none", 0, rounding=True)
+            return from_seed
         steps = _one_step(env, state, episode, exact, last_unknown)
         return replace(steps, rounding=not steps.faults)
     state = _StateSetter.of(env)
@@ -65,6 +78,7 @@ def replay_episode(env_spec: str, episode: RecordedEpisode, exact: bool, last_un
 
 
 def _from_seed(env: Env, e: RecordedEpisode, tolerance: float) -> ReplayResult:
+    """Replay an episode from its seed; `how` is none if observations differ, at first in the last bits only."""
     observations, rewards, ends = [reset(env, e.seed)], [], [False, False]
     for action in e.actions:
         observation, reward, *ends = step(env, action)
@@ -76,22 +90,25 @@ def _from_seed(env: Env, e: RecordedEpisode, tolerance: float) -> ReplayResult:
     played = np.array(observations).astype(e.observations.dtype)
     differs = _rows_differ(played, e.observations[: steps + 1], tolerance)
     first_off = int(np.flatnonzero(differs)[0]) if differs.any() else None
+    last_bits = max(WHOLE, 4 * float(np.finfo(played.dtype).eps)) if played.dtype.kind == "f" else WHOLE
     end_fault = ("steps-after-end", f"the environment ends at step {steps} of {len(e)}")
     if first_off is not None:
-        if not _rows_differ(played[[first_off]], e.observations[[first_off]], WHOLE).any():
-            return ReplayResult(e.index, "seed", first_off, rounding=True)
+        if not _rows_differ(played[[first_off]], e.observations[[first_off]], last_bits).any():
+            return ReplayResult(e.index, "none", first_off, rounding=True)
         # only the row after the environment's own end differs: the next episode begins there
         fault = end_fault if first_off == steps < len(e) else _diagnose(env, played, e, first_off, tolerance)
         return ReplayResult(e.index, "seed", steps, (fault,))
     faults = []
-    reward_differs = _rows_differ(np.array(rewards).astype(e.rewards.dtype), e.rewards[:steps], tolerance)
-    if reward_differs.any():
+    rewards_played, rewards_recorded = np.array(rewards).astype(e.rewards.dtype), e.rewards[:steps]
+    reward_differs = _rows_differ(rewards_played, rewards_recorded, tolerance)
+    rounding = reward_differs.any() and not _rows_differ(rewards_played, rewards_recorded, last_bits).any()
+    if reward_differs.any() and not rounding:
         faults.append(("other-rewards", f"from step {int(np.flatnonzero(reward_differs)[0])}"))
     if steps < len(e):
         faults.append(end_fault)
     else:
         faults += _compare_ends(bool(e.terminations[-1]), ends[0], len(e))
-    return ReplayResult(e.index, "seed", steps, tuple(faults))
+    return ReplayResult(e.index, "seed", steps, tuple(faults), rounding=bool(rounding))
 
 
 def _compare_ends(recorded: bool, played: bool, steps: int) -> list[tuple[str, str]]:
@@ -169,7 +186,8 @@ class _StateSetter:
         """Return whether a step from a restored state leads to the same observation as the original step."""
         observation, reward = reset(env, 0), 0.0
         rng = np.random.default_rng(0)
-        low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
+        space = box(env.action_space, "actions")
+        low, high = (np.where(np.isfinite(end), end, sign) for end, sign in ((space.low, -1), (space.high, 1)))
         before, action = observation, low
         for _ in range(5):
             before, action = observation, rng.uniform(low, high).astype(low.dtype)

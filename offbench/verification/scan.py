@@ -18,7 +18,7 @@ from offbench.verification.findings import Findings
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-MIN_CLIPPED = 10  # fewest equal actions at a least or greatest value that count as clipped,
+MIN_CLIPPED = 10  # minimum number of equal actions at a least or greatest value that count as clipped,
 MIN_CLIPPED_SHARE = 0.001  # their minimum share of all actions
 INSIDE = 1e-4  # share of the space's range: a value nearer than this to the space's bound counts as the bound
 
@@ -136,7 +136,8 @@ class _ClippingDetector:
 
     def report(self, findings: Findings) -> None:
         low, high = self.space.low.astype(np.float64), self.space.high.astype(np.float64)
-        inside = (self.ends[0] > low + INSIDE * (high - low), self.ends[1] < high - INSIDE * (high - low))
+        near = INSIDE * np.where(np.isfinite(high - low), high - low, 0.0)
+        inside = (self.ends[0] > low + near, self.ends[1] < high - near)
         for side, name in enumerate(("at least", "at most")):
             clipped = inside[side] & (self.counts[side] >= max(MIN_CLIPPED, MIN_CLIPPED_SHARE * self.total))
             for i in np.argwhere(clipped):

@@ -7,7 +7,7 @@ resimulate    a sample of episodes replayed in the environment
 
 from __future__ import annotations
 
-import json
+import contextlib
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
@@ -23,8 +23,9 @@ from offbench.common.text import counted
 from offbench.data import minari_store
 from offbench.data.file_stamps import unchanged
 from offbench.data.minari_reader import RecordedEpisode, episodes_of, open_minari, reading
-from offbench.data.recorded_env import margins_matter, recorded_margin, recorded_mujoco
-from offbench.envs.environments import box, same_bounds, untrusted_env
+from offbench.data.recorded_env import recorded_margin, recorded_mujoco
+from offbench.envs.contact_margins import margins_matter
+from offbench.envs.environments import box, parse_spec, same_bounds, time_limit, untrusted_env
 from offbench.envs.margin_rule import MAX_RULE, MUJOCO_VERSIONS, SUM_RULE, with_margin
 from offbench.rollouts.rollouts import Rollouts, result
 from offbench.verification.findings import Findings, Report
@@ -88,18 +89,18 @@ def _verify(dataset_id: str, episodes: int | None, workers: int | None) -> Repor
     _check_terminations(scanned, limit, findings)
     last = check_recorded_metadata(minari_store.read_provenance(metadata), scanned, limit, report, findings)
     chosen = _choose_episodes(scanned, limit, last, episodes)
-    _replay(data, chosen, scanned, metadata, workers, report, findings)
+    if episodes < 1:
+        report.skipped.append("playing episodes again: none were requested")
+    _replay(data, chosen, scanned, limit, metadata, workers, report, findings)
     report.findings = findings.all()
     return report
 
 
 def _limit(env_spec: str | None) -> int | None:
     """Return the time limit that an EnvSpec (JSON) names, if it does."""
-    try:
-        limit = json.loads(env_spec or "null")["max_episode_steps"]
-    except (TypeError, KeyError, ValueError, RecursionError):
-        return None
-    return limit if isinstance(limit, int) and limit > 0 else None
+    with contextlib.suppress(Exception):  # of an EnvSpec that is damaged, which `_replay` reports
+        return time_limit(parse_spec(env_spec or ""))
+    return None
 
 
 def _check_counts(metadata: JsonObject, dataset_id: str, scanned: ScanResult, findings: Findings) -> None:
@@ -122,6 +123,7 @@ def _replay(
     data: MinariDataset,
     chosen: Sequence[int],
     scanned: ScanResult,
+    limit: int | None,
     metadata: JsonObject,
     workers: int,
     report: Report,
@@ -141,7 +143,7 @@ def _replay(
     last_unknown = minari_store.read_provenance(metadata).final_observations == "repeated"
     steps = sum(scanned.lengths[i] for i in chosen)
     names = [int(data.episode_indices[i]) for i in chosen]
-    with Rollouts(spec, workers if workers > 1 and steps > FEW_STEPS else 0) as rollouts:
+    with Rollouts(spec, workers if steps > FEW_STEPS else 0) as rollouts:
 
         def replay(env_spec: str, episodes: Iterable[RecordedEpisode]) -> list[ReplayResult]:
             jobs = [
@@ -164,7 +166,18 @@ def _replay(
                     "to its requirements, so that policies are evaluated with them"
                 )
         replays = replay(with_margin(spec, rule or MAX_RULE), episodes_of(data, names))
+    at_limit = {int(data.episode_indices[i]) for i in chosen if _terminates_at(limit, scanned, i)}
+    confirmed = at_limit and all(replay.checks_end for replay in replays if replay.index in at_limit)
+    if confirmed and findings.withdraw("timeouts-as-terminations"):
+        report.warnings.append(
+            "every termination is exactly at the time limit, where the environment terminates too (episodes played "
+            "again show it)"
+        )
     _add_replays(replays, made if exact else None, report, findings)
+
+
+def _terminates_at(limit: int | None, scanned: ScanResult, i: int) -> bool:
+    return scanned.lengths[i] == limit and scanned.ended[i][0]
 
 
 def _same_spaces(env_spec: str, data: MinariDataset, report: Report, findings: Findings) -> bool:
@@ -190,13 +203,14 @@ def _choose_episodes(scanned: ScanResult, limit: int | None, last: Sequence[int]
         return []
     rng = seeds.generator(0, Purpose.SAMPLE)
     sample = rng.choice(valid, min(episodes, len(valid)), replace=False).tolist()
-    suspects = [i for i in valid if scanned.lengths[i] == limit and scanned.ended[i][0]][:episodes]
+    suspects = [i for i in valid if _terminates_at(limit, scanned, i)][:episodes]
     return sorted({*sample, *suspects, *(i for i in last if scanned.valid[i])})
 
 
 def _add_replays(replays: Sequence[ReplayResult], mujoco: str | None, report: Report, findings: Findings) -> None:
+    exact = mujoco and not any(replay.how == "seed" and replay.rounding for replay in replays)
     ways = {
-        "seed": f"from their seeds, {f'bit for bit (mujoco {mujoco})' if mujoco else 'within a tolerance'}",
+        "seed": f"from their seeds, {f'bit for bit (mujoco {mujoco})' if exact else 'within a tolerance'}",
         "step": "one step at a time from recorded states",
     }
     for how, method in ways.items():
@@ -213,7 +227,7 @@ def _add_replays(replays: Sequence[ReplayResult], mujoco: str | None, report: Re
     if open_ends:
         text = f"the {'ends' if open_ends > 1 else 'end'} of {counted(open_ends, 'episode')}"
         report.skipped.append(f"{text}: the last step cannot be played from its observation")
-    left = sum(replay.how == "none" for replay in replays)
+    left = sum(replay.how == "none" and not (replay.faults or replay.rounding) for replay in replays)
     if left:
         text = f"playing {counted(left, 'episode')} again"
         report.skipped.append(f"{text}: no seed, and no state to be set from observations")
