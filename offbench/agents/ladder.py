@@ -34,7 +34,7 @@ BEHAVIOUR = Path("behaviour")  # default folder of all trainings
 MEDIUM = 1 / 3  # fraction of the expert's normalized return
 MEDIUM_AT_MOST = 0.45  # a rung beyond this is chosen as medium only if there is no other
 MEDIUM_LIMITS = (0.2, 0.6)  # a medium outside these needs --accept
-NEAR = 0.05  # largest distance of a rung from a requested fraction; others need --accept
+NEAR = 0.05  # maximum distance of a rung from a requested fraction; others need --accept
 POLICY_NAME = re.compile(r"\w[\w.-]*\.safetensors")  # a file of the ladder's own folder, nothing else
 REFERENCE = ("return", "low", "high", "episodes")  # what each reference must have
 
@@ -113,6 +113,13 @@ class Ladder:
     def nearest(self, fraction: float) -> Rung:
         """Return the kept rung whose measured normalized return lies nearest `fraction`."""
         return min(self.rungs, key=lambda rung: abs(self.fraction(rung) - fraction))
+
+    def announce(self, rung: Rung, fraction: float) -> None:
+        """Print which policy is played for a requested fraction of the expert's return."""
+        inform(
+            f"the policy nearest {fraction:g} is the one of step {rung.step:,}: return {rung.ret:.0f}, "
+            f"{self.fraction(rung):.2f} of the expert's"
+        )
 
     def neighbors(self, fraction: float) -> list[Rung]:
         """Return the rungs next to `fraction`: the nearest below it and the nearest above, if there are."""

@@ -120,17 +120,13 @@ class Recording:
 
     def _nearest(self, fraction: float, accept: bool) -> Rung:
         rung = self.ladder.nearest(fraction)
-        where = self.ladder.fraction(rung)
-        if abs(where - fraction) > NEAR and not accept:
+        if abs(self.ladder.fraction(rung) - fraction) > NEAR and not accept:
             near = " and ".join(f"{self.ladder.fraction(r):.2f}" for r in self.ladder.neighbors(fraction))
             raise OffbenchError(
                 f"{self.recipe.name} has no policy within {NEAR} of {fraction:g} of the expert's return; the nearest: "
                 f"{near}; use one of these fractions, or `offbench collect --accept` to record the nearest"
             )
-        inform(
-            f"the policy nearest {fraction:g} is the one of step {rung.step:,}: return {rung.ret:.0f}, "
-            f"{where:.2f} of the expert's"
-        )
+        self.ladder.announce(rung, fraction)
         return rung
 
     def _check_medium(self, rung: Rung, accept: bool) -> None:

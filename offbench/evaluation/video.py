@@ -120,7 +120,10 @@ def _policy_of(path: str, env: str | Path | None) -> tuple[Policy, str, bool]:
             f"no ladder of {name} is shipped or in {BEHAVIOUR}/; give a policy file, or train an agent: "
             f"`offbench behaviour {name}`"
         )
-    rung = ladder.role(source) if source in ("medium", "expert") else ladder.nearest(float(source))
+    if source in ("medium", "expert"):
+        return ladder.load(ladder.role(source)), spec, True
+    rung = ladder.nearest(float(source))
+    ladder.announce(rung, float(source))
     return ladder.load(rung), spec, True
 
 

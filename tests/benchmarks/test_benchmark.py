@@ -8,9 +8,7 @@ import subprocess
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
 import offbench
@@ -19,18 +17,16 @@ from offbench.analysis.results import read_results
 from offbench.benchmarks.benchmark import LocalExecutor, benchmark
 from offbench.benchmarks.grid import load_grid, shipped_grids
 from offbench.benchmarks.plan import Benchmark, Cost, prepare, shard_of, write_plan
-from offbench.benchmarks.throughput import Rate, operations
+from offbench.benchmarks.throughput import Rate
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.common.settings import fields as settings_of
 from offbench.data import minari_store
-from offbench.envs.recipes import load_recipe
 from offbench.reports.tables import score_table
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run, find_runs
-from offbench.training.spec import Job, RunSpec
+from offbench.training.spec import Job
 from tests.made_runs import made_run
-from tests.speed.arithmetic import ALGORITHMS
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]
 GRID = """
@@ -125,16 +121,6 @@ def test_shipped_grids_are_sound_and_their_plan_counts_what_is_left(name: str) -
     assert any("to record first" in line for line in lines)
     assert "on 2 processes of one thread about" in lines[-2]
     assert "on a GPU: not measured here" in lines[-1]
-
-
-@pytest.mark.parametrize(("algorithm", "settings"), [("td3_bc", {}), ("bdb", {}), ("cql", {"bc_steps": 0})])
-def test_the_plans_operations_are_those_counted_by_hand(algorithm: str, settings: dict[str, Any]) -> None:
-    config: Any = load_algorithm(algorithm).Config(**settings)
-    spec = RunSpec(algorithm, config, "any-v0", 0, 1, 1, 1, Path())
-    by_hand = ALGORITHMS[algorithm](11, 3, config.batch_size, config.hidden)
-    wanted = sum(often * 2 * np.prod([float(size) for size in product]) for often, product in by_hand)
-    counted = operations(spec, load_recipe("hopper").env_spec())
-    assert counted == pytest.approx(wanted, rel=1e-9)
 
 
 def test_settings_of_each_dataset_are_one_column(home: Path) -> None:

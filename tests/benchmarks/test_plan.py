@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 import offbench
 from offbench.analysis.results import read_results
 from offbench.benchmarks.benchmark import benchmark
 from offbench.benchmarks.plan import prepare
+from offbench.benchmarks.throughput import operations
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
+from offbench.envs.recipes import load_recipe
+from offbench.training.registry import load_algorithm
 from offbench.training.run import find_runs
+from offbench.training.spec import RunSpec
 from tests.benchmarks.test_benchmark import GRID, plan_lines
+from tests.speed.arithmetic import ALGORITHMS
 
 
 def silent(_: str) -> None:
@@ -82,3 +89,13 @@ def test_runs_behind_a_link_are_found_once(medium: str, home: Path) -> None:
     assert [row["method"] for row in offbench.normalize()] == ["bc"]
     with pytest.raises(OffbenchError, match="no evaluated runs"):
         offbench.normalize("elsewhere")
+
+
+@pytest.mark.parametrize(("algorithm", "settings"), [("td3_bc", {}), ("bdb", {}), ("cql", {"bc_steps": 0})])
+def test_the_plans_operations_are_those_counted_by_hand(algorithm: str, settings: dict[str, Any]) -> None:
+    config: Any = load_algorithm(algorithm).Config(**settings)
+    spec = RunSpec(algorithm, config, "any-v0", 0, 1, 1, 1, Path())
+    by_hand = ALGORITHMS[algorithm](11, 3, config.batch_size, config.hidden)
+    wanted = sum(often * 2 * np.prod([float(size) for size in product]) for often, product in by_hand)
+    counted = operations(spec, load_recipe("hopper").env_spec())
+    assert counted == pytest.approx(wanted, rel=1e-9)

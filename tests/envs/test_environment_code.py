@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -77,6 +78,22 @@ def test_a_model_that_an_argument_names_is_hashed(home: Path) -> None:
     assert list(before) == ["heavy.xml"]
     model.write_text(model.read_text().replace('gravity="0 0 -9.81"', 'gravity="0 0 -5"'))
     assert environment_code(spec) != before
+
+
+def test_files_of_one_name_and_in_lists_are_all_hashed(home: Path) -> None:
+    names = ["a/model.xml", "b/model.xml", "c/part.xml"]
+    for name in names:
+        (home / name).parent.mkdir()
+        (home / name).write_text(name)
+    robot, scene, part = (str(home / name) for name in names)
+    spec = {"entry_point": "gymnasium.envs:X", "kwargs": {"robot": robot, "scene": scene, "assets": {"all": [part]}}}
+    before = environment_code(json.dumps(spec))
+    assert list(before) == ["model.xml", "model.xml (scene)", "part.xml"]
+    for name in names:
+        (home / name).write_text("edited")
+        after = environment_code(json.dumps(spec))
+        assert sum(before[key] != after[key] for key in before) == 1
+        before = after
 
 
 def test_an_edit_is_noticed(home: Path, recipe: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -25,13 +25,14 @@ from offbench.envs.environments import (
     same_environment,
     untrusted_env,
 )
+from offbench.envs.margin_rule import SUM_RULE, with_margin
 from offbench.envs.recipes import d4rl_reference_of_env
 from offbench.rollouts.policy import uniform_policy
 from offbench.rollouts.rollouts import ErrorReporting, Rollouts, gather, scalar_reward
 from offbench.verification.resimulate import replay_episode
 
 PENDULUM = (np.full(1, -3, np.float32), np.full(1, 3, np.float32))
-HOPPER = (-20.272305, 3234.3)  # D4RL's infos.py
+HOPPER, HALFCHEETAH = (-20.272305, 3234.3), (-280.178953, 12135.0)  # D4RL's infos.py
 
 
 class Steps(gym.Env[Any, Any]):
@@ -114,7 +115,7 @@ def test_wrappers_that_change_rewards_or_episodes_make_another_environment(other
 def test_wrappers_and_other_namespaces_have_no_d4rl_score() -> None:
     plain = json.loads(env_spec("Hopper-v5"))
     watched = gym.wrappers.RecordEpisodeStatistics(gym.make("Hopper-v5")).spec
-    changed = gym.wrappers.NormalizeReward(gym.make("Hopper-v5")).spec
+    changed = gym.wrappers.ClipReward(gym.make("Hopper-v5"), 0.0, 1.0).spec
     assert watched is not None
     assert changed is not None
     assert d4rl_reference_of_env(watched.to_json()) == HOPPER
@@ -127,6 +128,21 @@ def test_wrappers_and_other_namespaces_have_no_d4rl_score() -> None:
         assert d4rl_reference_of_env(json.dumps(plain | other)) is None
     assert d4rl_reference_of_env(env_spec("InvertedPendulum-v5")) is None
     assert d4rl_reference_of_env(None) is None
+    for env_id, reference in (("Hopper-v5", None), ("HalfCheetah-v5", HALFCHEETAH)):  # which has no margins
+        assert d4rl_reference_of_env(with_margin(env_spec(env_id), SUM_RULE)) == reference
+
+
+@pytest.mark.parametrize("wrapper", [gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward])
+def test_wrappers_whose_episodes_depend_on_earlier_ones_are_refused(wrapper: Any) -> None:
+    spec = wrapper(gym.make("InvertedPendulum-v5")).spec
+    with pytest.raises(OffbenchError, match=f"x-v0: the environment has the wrapper {wrapper.__name__}, whose stat"):
+        untrusted_env(spec.to_json(), "x-v0")
+    gym.register("Wrapped-v0", spec.entry_point, max_episode_steps=5, additional_wrappers=spec.additional_wrappers)
+    try:
+        with pytest.raises(OffbenchError, match=wrapper.__name__):
+            env_spec("Wrapped-v0")
+    finally:
+        del gym.registry["Wrapped-v0"]
 
 
 @pytest.mark.parametrize("bound", [np.finfo(np.float32).max, 1e30, 2e6])

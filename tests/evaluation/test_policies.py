@@ -53,6 +53,19 @@ def test_a_policy_plays_in_a_gymnasium_loop(medium: str, home: Path) -> None:
         offbench.load_policy(home)
 
 
+def test_a_policy_file_in_a_runs_folder_is_evaluated_in_the_runs_environment(home: Path) -> None:
+    """Its own metadata name the environment's id alone, and not the arguments."""
+    (home / "noisy.toml").write_text('env_id = "InvertedPendulum-v5"\n[env_kwargs]\nreset_noise_scale = 0.2\n')
+    dataset = offbench.collect(home / "noisy.toml", "random", steps=300, workers=1)
+    (folder,) = offbench.train("bc", dataset, **SMALL)
+    of_run = offbench.evaluate(folder, episodes=3, workers=1)
+    of_file = offbench.evaluate(folder / "policy.safetensors", episodes=3, workers=1)
+    assert (of_file.returns, of_file.scores) == (of_run.returns, of_run.scores)
+    (home / "copied").mkdir()
+    (folder / "policy.safetensors").rename(home / "copied" / "policy.safetensors")
+    assert offbench.evaluate(home / "copied" / "policy.safetensors", episodes=3, workers=1).returns != of_run.returns
+
+
 def test_policies_that_choose_at_random_need_no_noise_either() -> None:
     low, high = np.array([-1.0, 0.0], np.float32), np.array([1.0, 5.0], np.float32)
     policy = uniform_policy(low, high, 3, "x")

@@ -59,6 +59,54 @@ def test_an_mp4_is_a_film_of_its_frames(home: Path) -> None:
 
 
 @pytest.mark.usefixtures("draws")
+def test_an_mp4_that_lacks_frames_is_an_error(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where the disk is full when the encoder writes the end; an earlier video stays."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed: no mp4 was recorded")
+    made = video.video(POLICY, out="film.mp4", seconds=0.4, size=64)
+    before, write = made.read_bytes(), ffmpeg.write_frames
+
+    def generator(path: str, *words: object, **options: object) -> object:
+        inner = write(path, *words, **options)
+
+        class Cut:
+            def send(self, frame: object) -> None:
+                inner.send(frame)
+
+            def close(self) -> None:
+                inner.close()
+                os.truncate(path, Path(path).stat().st_size // 2)
+
+        return Cut()
+
+    monkeypatch.setattr(ffmpeg, "write_frames", generator)
+    with pytest.raises(OffbenchError, match=r"film.mp4: the encoder wrote \d+ of \d+ frames"):
+        video.video(POLICY, out="film.mp4", seconds=0.6, size=64)
+    assert made.read_bytes() == before
+    assert not list(home.glob(".film*"))
+
+
+@pytest.mark.parametrize("fps", [12.5, 30.0, 48.0])
+def test_a_gif_runs_in_real_time(fps: float, home: Path) -> None:
+    frames = [Image.new("RGB", (8, 8), (index, 0, 0)) for index in range(60)]
+    video._gif(home / "x.gif", iter(frames), fps)
+    durations = []
+    with Image.open(home / "x.gif") as film:
+        for index in range(film.n_frames):
+            film.seek(index)
+            durations.append(film.info["duration"])
+    assert sum(durations) == pytest.approx(1000 * 60 / fps, abs=10)
+    assert min(durations) >= 20
+
+
+@pytest.mark.usefixtures("draws")
+def test_a_gif_has_no_frames_that_browsers_slow_down(home: Path) -> None:
+    """Hopper takes 125 steps a second: more than 50 frames would be less than 0.02 s each."""
+    made = video.video("hopper:random", out="film.gif", seconds=0.4, fps=125, size=64)
+    with Image.open(made) as film:
+        assert film.info["duration"] >= 20
+
+
+@pytest.mark.usefixtures("draws")
 def test_a_film_of_a_run_plays_its_environment(medium: str, home: Path) -> None:
     import offbench
 
@@ -104,6 +152,8 @@ def test_the_users_choice_of_backend_is_put_back(monkeypatch: pytest.MonkeyPatch
         ([str(POLICY), "--out", "new/a.gif"], "cannot write new/a.gif: there is no folder new"),
         ([str(POLICY), "--env", "hopper", "--out", "a.gif"], "--env RECIPE"),
         ([str(POLICY), "--seconds", "0", "--out", "a.gif"], "more than 0"),
+        ([str(POLICY), "--seconds", "nan", "--out", "a.gif"], "finite"),
+        ([str(POLICY), "--seconds", "inf", "--out", "a.gif"], "finite"),
         ([str(POLICY), "--fps", "0", "--out", "a.gif"], "whole number from 1"),
     ],
 )

@@ -85,7 +85,7 @@ def test_leftovers_of_any_process_are_removed_under_the_lock(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("rows", "names"),
     [
-        (ROWS + "200,0,99999.0,5\n", "twice"),
+        (ROWS + "200,0,99999.0,5\n", "duplicated"),
         (ROWS + "-7,0,1.0,5\n", "-7"),
         (ROWS + "9" * 400 + ",0,1.0,5\n", "999"),
         (ROWS + "300,0,1.0,5\n300,1,1.0,5\n", "step 300"),

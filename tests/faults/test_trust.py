@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
-from offbench import collect
+from offbench import collect, train
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.envs.environments import env_spec
 from offbench.envs.trust import VARIABLE, check_code
+from offbench.evaluation import renderer
 from offbench.evaluation.evaluate import evaluate, open_policy
 from offbench.rollouts.policy import uniform_policy
+from offbench.training.run import Run
 from tests.cli.test_bad_input import refusal
 from tests.faults.test_integrity import trained
 
@@ -51,6 +55,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"kwargs": {"xml_file": "./fifo"}}, "./fifo"),
     ({"kwargs": {"xml_file": "~root"}}, "~root"),
     ({"kwargs": {"xml_file": "..\\x"}}, "..\\\\x"),
+    ({"kwargs": {"env_id": "this:X-v0"}}, "this:X-v0"),  # Gymnasium imports what is before a colon
     ({"kwargs": {"a": nested(20)}}, "nested"),
     ({"kwargs": {"a": [0] * 20_000}}, "too many"),
     ({"kwargs": {"/etc/passwd": 0}}, "/etc/passwd"),
@@ -138,5 +143,49 @@ def test_a_plan_runs_nothing_that_a_dataset_names(own: Path, capsys: pytest.Capt
 
 def test_the_variable_is_for_python(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = run_of({"id": "Own-v0", "entry_point": "own:Own"}, own)
+    for value in ("", "0", "false", "no"):
+        monkeypatch.setenv(VARIABLE, value)
+        with pytest.raises(OffbenchError, match="own:Own"):
+            open_policy(run)
     monkeypatch.setenv(VARIABLE, "1")
     assert len(evaluate(str(run), episodes=1, workers=1).returns) == 1
+
+
+def test_ones_own_recipe_needs_no_trust(own: Path) -> None:
+    """It may name any code and file, also where a policy that was handed over is evaluated, or a run is trained."""
+    model = own / "model.xml"
+    model.write_bytes((Path(gym.envs.mujoco.__file__).parent / "assets" / "inverted_pendulum.xml").read_bytes())
+    (own / "mine.toml").write_text(f'env_id = "InvertedPendulum-v5"\n[env_kwargs]\nxml_file = "{model}"\n')
+    uniform_policy(np.array([-3.0], np.float32), np.array([3.0], np.float32), 4, "").save(own / "x.safetensors")
+    assert len(evaluate("x.safetensors", env="./mine.toml", episodes=1, workers=1).returns) == 1
+    dataset = collect("inverted-pendulum", "random", steps=300, workers=1)
+    settings: dict[str, Any] = {"hidden": (8,), "batch_size": 4, "eval_episodes": 1, "workers": 1}
+    (run,) = train("bc", dataset, env="./mine.toml", steps=2, eval_every=2, **settings)
+    assert Run(run).evaluations()
+
+
+@pytest.mark.parametrize("command", ["evaluate", "train"])
+def test_files_in_the_working_directory_are_not_imported(command: str, medium: str, home: Path) -> None:
+    """Python puts the working directory on the path of a process that it starts with `-c`, as it does for workers."""
+    small = ["--hidden", "8", "--batch-size", "4", "--eval-every", "2", "--eval-episodes", "2", "--workers", "2"]
+    training = ["train", "bc", "--dataset", medium, "--seeds", "0:2", *small]
+    main([*training, "--steps", "2"])
+    for module in ("socket", "queue", "secrets", "mujoco", "signal"):
+        (home / f"{module}.py").write_text(f"open({str(home / 'RAN')!r}, 'w').close()\nraise SystemExit(module)\n")
+    launcher = home / "bin" / "launch.py"  # as the installed script, which is in another folder
+    launcher.parent.mkdir()
+    launcher.write_text("from offbench.cli.main import main\nif __name__ == '__main__':\n    main()\n")
+    run = str(next((home / "runs").rglob("seed-0")))
+    evaluation = ["evaluate", run, "--episodes", "4", "--workers", "2"]
+    words = evaluation if command == "evaluate" else [*training, "--steps", "4"]
+    done = subprocess.run(
+        [sys.executable, str(launcher), *words], capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert not (home / "RAN").exists()
+
+
+def test_the_renderer_is_probed_without_the_working_directory(home: Path) -> None:
+    (home / "mujoco.py").write_text("open('RAN', 'w').close()\n")
+    renderer.working_backend.__wrapped__()
+    assert not (home / "RAN").exists()

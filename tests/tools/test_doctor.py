@@ -69,6 +69,14 @@ def test_a_broken_algorithm_and_a_missing_package_are_named(monkeypatch: pytest.
     assert "minari not installed" in found["versions", "broken"]
 
 
+def test_a_folder_with_the_name_of_an_extra_is_no_package(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """W&B writes a folder `wandb`, which Python takes for a package without files."""
+    (home / "wandb_of_mine").mkdir()
+    monkeypatch.syspath_prepend(str(home))
+    monkeypatch.setattr(doctor, "EXTRAS", {"wandb_of_mine": "live views"})
+    assert list(doctor._extras()) == [("note", "wandb_of_mine is not installed (live views)")]
+
+
 def test_no_renderer_is_worth_a_note_and_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     from offbench.evaluation import renderer
 
