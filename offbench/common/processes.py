@@ -58,6 +58,11 @@ def default_workers(workers: int | None) -> int:
     return workers
 
 
+def blocking_workers(workers: int) -> int:
+    """Return the worker processes of a pool that this process only waits for: none instead of a single one."""
+    return workers if workers > 1 else 0
+
+
 @contextlib.contextmanager
 def process_start() -> Iterator[None]:
     """Start a process, or what it needs, such as shared memory.

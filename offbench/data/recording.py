@@ -11,6 +11,7 @@ from offbench.agents.ladder import MEDIUM, MEDIUM_AT_MOST, MEDIUM_LIMITS, NEAR, 
 from offbench.agents.medium_replay import load_replay
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, sha256
+from offbench.common.processes import blocking_workers
 from offbench.common.terminal import inform
 from offbench.data.behaviour_policy import BehaviourPolicy, read_behaviour_policy
 from offbench.data.levels import Part, full_size, shares
@@ -55,7 +56,7 @@ class Recording:
         accept: bool,
     ) -> None:
         self.recipe, self.parts, self._ladder, self.seed = recipe, parts, ladder, seed
-        self.workers = workers
+        self.workers = blocking_workers(workers)
         self.env_spec = recipe.env_spec()
         env = make_env(self.env_spec)
         model = model_of(env)

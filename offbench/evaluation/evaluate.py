@@ -12,7 +12,7 @@ import numpy as np
 from offbench.agents.ladder import shipped_references
 from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError
-from offbench.common.processes import default_workers
+from offbench.common.processes import blocking_workers, default_workers
 from offbench.common.scores import interval, mean_std, normalize
 from offbench.common.seeds import Purpose, check_seed
 from offbench.common.terminal import warn
@@ -87,7 +87,7 @@ def evaluate(
     policy, config, spec = open_policy(path, env)
     if stochastic and not policy.stochastic:
         raise OffbenchError(f"{path} is a deterministic policy; leave out --stochastic")
-    with Rollouts(spec, default_workers(workers)) as rollouts:
+    with Rollouts(spec, blocking_workers(default_workers(workers))) as rollouts:
         episode_stats = rollouts.evaluate(policy, seed, (int(Purpose.REFERENCE), 2), episodes, not stochastic)
     returns = [episode.ret for episode in episode_stats]
     env_id = json.loads(spec)["id"]

@@ -287,13 +287,12 @@ def cached_envs(env_spec: str, count: int) -> list[Env]:
 
 
 class Rollouts:
-    """Plays episodes of one environment, in this process (workers = 0 or 1) or in a pool of worker processes.
+    """Plays episodes of one environment, in this process (workers = 0) or in a pool of worker processes.
 
     Use as a context manager. Results do not depend on `workers`. A FunctionPolicy needs workers = 0.
     """
 
     def __init__(self, env_spec: str, workers: int = 0) -> None:
-        workers = workers if workers > 1 else 0  # a single one would be no faster than this process
         self.env_spec, self.workers = env_spec, workers
         self._pool: ProcessPoolExecutor | None = None
         if workers:

@@ -16,7 +16,7 @@ from gymnasium.spaces import Box
 from offbench.common import seeds
 from offbench.common.errors import DamagedError, OffbenchError
 from offbench.common.files import JsonObject
-from offbench.common.processes import default_workers
+from offbench.common.processes import blocking_workers, default_workers
 from offbench.common.provenance import versions
 from offbench.common.seeds import Purpose
 from offbench.common.text import counted
@@ -143,7 +143,7 @@ def _replay(
     last_unknown = minari_store.read_provenance(metadata).final_observations == "repeated"
     steps = sum(scanned.lengths[i] for i in chosen)
     names = [int(data.episode_indices[i]) for i in chosen]
-    with Rollouts(spec, workers if steps > FEW_STEPS else 0) as rollouts:
+    with Rollouts(spec, blocking_workers(workers) if steps > FEW_STEPS else 0) as rollouts:
 
         def replay(env_spec: str, episodes: Iterable[RecordedEpisode]) -> list[ReplayResult]:
             jobs = [
