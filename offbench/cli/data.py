@@ -52,9 +52,15 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
     _behaviour_dir(parser)
 
     def run(**arguments: Any) -> None:
+        from offbench.envs.environments import parse_spec
+        from offbench.envs.recipes import load_recipe
+        from offbench.envs.trust import needs_trust
+
         dataset_id = offbench.collect(**arguments)
         print(dataset_id)
-        hint("offbench", "train", "td3_bc", "--dataset", dataset_id)
+        spec = parse_spec(load_recipe(arguments["env"]).env_spec())
+        trust = ["--trust"] if needs_trust(spec) else []
+        hint("offbench", "train", "td3_bc", "--dataset", dataset_id, *trust)
 
     parser.set_defaults(run=run)
 

@@ -94,6 +94,18 @@ def check_code(spec: EnvSpec) -> None:
             )
 
 
+def needs_trust(spec: EnvSpec) -> bool:
+    """Return whether a file with this EnvSpec is refused without --trust, in a process that has registered nothing."""
+    names = ENTRY_POINT.fullmatch(str(spec.entry_point))
+    if names is None or not f"{names[1]}.".startswith(PACKAGES):
+        return True
+    try:
+        check_code(spec)
+    except OffbenchError:
+        return True
+    return False
+
+
 def _check_class(entry_point: object, base: type) -> None:
     names = ENTRY_POINT.fullmatch(str(entry_point))
     if names is None:

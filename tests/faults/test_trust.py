@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from offbench.training.run import Run
 from tests.cli.test_bad_input import refusal
 from tests.faults.test_integrity import trained
 
+Cli = Callable[..., subprocess.CompletedProcess[str]]
 POLE = json.loads(env_spec("InvertedPendulum-v5"))
 OWN = "from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv as Own\n"
 OWN += "open('IMPORTED', 'w').close()\n"
@@ -162,6 +165,23 @@ def test_ones_own_recipe_needs_no_trust(own: Path) -> None:
     settings: dict[str, Any] = {"hidden": (8,), "batch_size": 4, "eval_episodes": 1, "workers": 1}
     (run,) = train("bc", dataset, env="./mine.toml", steps=2, eval_every=2, **settings)
     assert Run(run).evaluations()
+
+
+def test_the_next_command_has_the_trust_that_it_needs(
+    own: Path, offbench_cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A registration that `collect` has imported is not there in the process of the next command."""
+    (own / "own.py").write_text(
+        OWN + "import gymnasium\ngymnasium.register('Own-v0', 'own:Own', max_episode_steps=9)\n"
+    )
+    (own / "mine.toml").write_text('env_id = "own:Own-v0"\n')
+    monkeypatch.setenv("PYTHONPATH", f"{own}:{os.environ.get('PYTHONPATH', '')}")
+    for env, trust in (("mine.toml", ["--trust"]), ("inverted-pendulum", [])):
+        done = offbench_cli("collect", env, "--level", "random", "--steps", "300")
+        command = shlex.split(done.stderr.rpartition("next: ")[2])
+        assert command[5:] == trust
+        done = offbench_cli(*command[1:], "--steps", "2", "--eval-every", "2", "--hidden", "8", "--workers", "1")
+        assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("command", ["evaluate", "train"])
