@@ -218,7 +218,7 @@ def check_output_folder(out: Path) -> Path:
         raise OffbenchError(f"{out} is a file; a ladder needs a folder of its own")
     if out.exists() and any(out.iterdir()) and not (out / "ladder.json").exists():
         raise OffbenchError(
-            f"{out} holds other files, which a ladder would replace; delete it, or give an empty or new folder"
+            f"{out} contains other files, which a ladder would replace; delete it, or give an empty or new folder"
         )
     return out
 

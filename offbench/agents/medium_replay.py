@@ -128,7 +128,7 @@ def load_replay(
 
 
 def _arrays(data: bytes, obs: int, act: int) -> dict[str, Array]:
-    """Return the arrays of a replay file. Raises ValueError if they do not fit together or hold NaN."""
+    """Return the arrays of a replay file. Raises ValueError if they do not fit together or contain NaN."""
     with h5py.File(io.BytesIO(data), "r") as file:
         if elsewhere := stored_elsewhere(file):
             raise ValueError(f"{elsewhere} is not data of this file")
@@ -145,7 +145,7 @@ def _arrays(data: bytes, obs: int, act: int) -> dict[str, Array]:
         if arrays[name].shape != shape:
             raise ValueError(f"{name} have shape {arrays[name].shape}, not {shape}")
         if not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{name} hold NaN or infinite numbers")
+            raise ValueError(f"{name} contain NaN or infinite numbers")
     lengths = arrays["lengths"]
     if not ((lengths >= 1) & (lengths <= steps)).all() or lengths.sum() != steps:
         raise ValueError(f"the lengths of its episodes do not add up to {steps}")

@@ -93,8 +93,8 @@ def _check_identity(folder: TrainingFolder) -> None:
     identity["sac"] = recipe["sac"] | {"hidden": list(recipe["sac"]["hidden"])}
     path, code = folder.path / "training.json", environment_code(folder.recipe.env_spec())
     if not path.exists():
-        made = {"recipe_sha256": folder.recipe.sha256(), "versions": versions(), "hardware": hardware()}
-        write_json(path, identity | {"env_code": code} | made)
+        origin = {"recipe_sha256": folder.recipe.sha256(), "versions": versions(), "hardware": hardware()}
+        write_json(path, identity | {"env_code": code} | origin)
         return
     recorded = read_json(path, f"delete {folder.path} to train the agent again")
     if edited := describe_changes(recorded.get("env_code", {}), code):

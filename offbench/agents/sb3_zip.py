@@ -53,7 +53,7 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
     kind, layers, algorithm, default = _layers(path, tensors)
     activation = _activation(path, settings, default)
     if any(not np.isfinite(array).all() for pair in layers for array in pair):
-        raise OffbenchError(f"{path} holds NaN or infinite weights")
+        raise OffbenchError(f"{path} contains NaN or infinite weights")
     if kind == "gaussian" and settings.get("_last_original_obs") is not None:  # SAC and TD3 always set it
         raise OffbenchError(
             f"{path} was trained with VecNormalize, whose statistics are not in the zip; "
@@ -70,7 +70,7 @@ def _read(path: Path) -> tuple[dict[str, Array], JsonObject]:
     """Return the tensors of policy.pth and the plain settings of data.
 
     Raises:
-        OffbenchError: policy.pth holds more than tensors.
+        OffbenchError: policy.pth contains more than tensors.
         Exception: whatever zipfile and torch raise for damaged bytes.
     """
     import torch
@@ -84,7 +84,7 @@ def _read(path: Path) -> tuple[dict[str, Array], JsonObject]:
             try:
                 weights = torch.load(io.BytesIO(archive.read("policy.pth")), map_location="cpu", weights_only=True)
             except (pickle.UnpicklingError, RecursionError):
-                raise OffbenchError(f"{path} is refused: its policy.pth holds more than tensors") from None
+                raise OffbenchError(f"{path} is refused: its policy.pth contains more than tensors") from None
         settings = json.loads(archive.read("data"))
     if not isinstance(weights, Mapping) or not isinstance(settings, dict):
         raise ValueError("its policy.pth or data are not what SB3 writes")
@@ -113,7 +113,7 @@ def _layers(path: Path, tensors: Mapping[str, Array]) -> tuple[str, Layers, str,
             return "gaussian", (*_sequence(tensors, "mlp_extractor.policy_net"), head), "PPO or A2C", "tanh"
     except (KeyError, ValueError, IndexError) as error:
         raise OffbenchError(f"{path} is not an MLP policy as SB3 saves it: {error}") from None
-    raise OffbenchError(f"{path} holds no policy of SAC, TD3, DDPG, PPO or A2C with an MLP")
+    raise OffbenchError(f"{path} contains no policy of SAC, TD3, DDPG, PPO or A2C with an MLP")
 
 
 def sac_layers(tensors: Mapping[str, Array]) -> Layers:

@@ -46,12 +46,12 @@ def hardware() -> Hardware:
 
 def training_platform(device: str, precision: str) -> TrainingPlatform:
     """Return the versions and hardware of training on `device` (cpu, cuda or cuda:N) with `precision`."""
-    made = hardware()
+    machine = hardware()
     if device != "cpu":
         import torch
 
-        made["gpu"] = torch.cuda.get_device_name(device)
-    return {"device": device, "precision": precision, "versions": versions(), "hardware": made}
+        machine["gpu"] = torch.cuda.get_device_name(device)
+    return {"device": device, "precision": precision, "versions": versions(), "hardware": machine}
 
 
 def has_bfloat16() -> bool:

@@ -83,7 +83,7 @@ def level_name(name: str | None, source: str) -> str:
     own = re.sub(r"[^a-z0-9]+", "-", Path(source.rpartition(":")[2]).stem.lower()).strip("-")
     level = name or own or "policy"
     if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", level):
-        raise OffbenchError(f"--name may hold a-z, 0-9 and single hyphens, not {level!r}")
+        raise OffbenchError(f"--name can contain a-z, 0-9 and single hyphens, not {level!r}")
     if level in LEVELS or re.fullmatch(FRACTION, level):
         raise OffbenchError(f"{level!r} is a level of offbench's own agents; give another --name")
     return level

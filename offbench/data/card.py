@@ -63,11 +63,11 @@ def card(env: str | Path, out: str | Path | None = None, behaviour_dir: str | Pa
     if sorted(means) != means:
         warn(f"the levels of {recipe.name} are out of order: {means}")
     folder = Path(out or f"{recipe.name}-card")
-    made = {name: versions()[name] for name in PHYSICS}
-    _add_shipped_hashes(recipe, facts, made["mujoco"])
-    write_json(folder / "card.json", {"format": "offbench-card-2", "versions": made, "levels": facts})
+    used = {name: versions()[name] for name in PHYSICS}
+    _add_shipped_hashes(recipe, facts, used["mujoco"])
+    write_json(folder / "card.json", {"format": "offbench-card-2", "versions": used, "levels": facts})
     _draw(recipe, ladder, levels, folder / "card.png")
-    write_bytes(folder / "README.md", _text(env, recipe, ladder, facts, made).encode())
+    write_bytes(folder / "README.md", _text(env, recipe, ladder, facts, used).encode())
     return folder
 
 
@@ -83,8 +83,8 @@ def compare_with_card(recipe: Recipe, level: str, content_sha256: str) -> str | 
     if content_sha256 in contents.values():
         return "content equal to the dataset card's, bit for bit"
     here = versions()["mujoco"]
-    made = card["versions"] | {"mujoco": here if here in contents else next(iter(contents))}
-    others = [f"{name} {version}" for name, version in made.items() if versions()[name] != version]
+    used = card["versions"] | {"mujoco": here if here in contents else next(iter(contents))}
+    others = [f"{name} {version}" for name, version in used.items() if versions()[name] != version]
     reason = (
         f"which was made with {', '.join(others)}"
         if others
@@ -149,7 +149,7 @@ def _facts(recipe: Recipe, summary: Summary) -> JsonObject:
     }
 
 
-def _text(env: str, recipe: Recipe, ladder: Ladder, facts: JsonObject, made: Mapping[str, str]) -> str:
+def _text(env: str, recipe: Recipe, ladder: Ladder, facts: JsonObject, used: Mapping[str, str]) -> str:
     info = ladder.info
     header = ["level", "transitions", "episodes", "mean return", "std", "min", "max"]
     header += ["score (own ref.)", "score (D4RL ref.)", "episodes terminated"]
@@ -175,7 +175,7 @@ def _text(env: str, recipe: Recipe, ladder: Ladder, facts: JsonObject, made: Map
     if recipe.folder:
         saved = "[behaviour/ladder.csv](behaviour/ladder.csv)"
         links = f"settings and their reasons: [recipe.toml](recipe.toml); all saved policies: {saved}"
-    others = ", ".join(f"{name} {version}" for name, version in made.items() if name != "mujoco")
+    others = ", ".join(f"{name} {version}" for name, version in used.items() if name != "mujoco")
     return f"""\
 # {recipe.name}: {recipe.env_id}
 

@@ -170,12 +170,14 @@ def _counted(episodes: Iterator[Episode], progress: Progress) -> Iterator[Episod
 
 def _metadata(recording: Recording, dataset_id: str, level: str) -> JsonObject:
     """Return the dataset's metadata: Minari's fields, and offbench's own under one key."""
-    recipe, references, made = recording.recipe, recording.references, versions()
+    recipe, references, installed = recording.recipe, recording.references, versions()
     full, total = recording.full_size, sum(recording.counts)
-    mujoco, margins = f"mujoco=={made['mujoco']}", ""
+    mujoco, margins = f"mujoco=={installed['mujoco']}", ""
     if recording.has_margins:
         margins = f" Contact margins as in MuJoCo {MUJOCO_VERSIONS[recipe.contact_margin]}: see offbench.make_env."
-        if recipe.contact_margin == MAX_RULE and same_physics(LAST_WITH_MAX_RULE, made["mujoco"], recording.env_spec):
+        if recipe.contact_margin == MAX_RULE and same_physics(
+            LAST_WITH_MAX_RULE, installed["mujoco"], recording.env_spec
+        ):
             mujoco = f"mujoco<={LAST_WITH_MAX_RULE}"
     short = f" A short recording: {total:,} of {full:,} transitions." if total < full else ""
     if recording.own_policy:
@@ -185,14 +187,14 @@ def _metadata(recording: Recording, dataset_id: str, level: str) -> JsonObject:
         algorithm = "random" if uniform else "SAC (Stable-Baselines3)"
     return {
         "dataset_id": dataset_id,
-        "minari_version": made["minari"],
+        "minari_version": installed["minari"],
         "eval_env_spec": without_margin(recording.env_spec)[0],
         "algorithm_name": algorithm,
         "author": {"offbench"},
         "author_email": {"offbench@example.org"},
-        "code_permalink": f"{REPOSITORY}/tree/v{made['offbench']}",
+        "code_permalink": f"{REPOSITORY}/tree/v{installed['offbench']}",
         "description": f"{recipe.env_id}, level {level}: {recording.origin}. Recorded by offbench.{margins}{short}",
-        "requirements": [mujoco, f"gymnasium=={made['gymnasium']}"],
+        "requirements": [mujoco, f"gymnasium=={installed['gymnasium']}"],
         "ref_min_score": references["random"]["return"],
         **({"ref_max_score": references["expert"]["return"]} if "expert" in references else {}),
         "num_episodes_average_score": int(references["random"]["episodes"]),
@@ -208,6 +210,6 @@ def _metadata(recording: Recording, dataset_id: str, level: str) -> JsonObject:
             "d4rl": recipe.d4rl_reference(),
             MARGIN_KEY: recipe.contact_margin if recording.uses_mujoco else None,
             **({"env_code": code} if (code := environment_code(recording.env_spec)) else {}),
-            "versions": made,
+            "versions": installed,
         },
     }

@@ -89,7 +89,7 @@ def _check(path: Path, columns: dict[str, h5py.Dataset]) -> None:
         if not (flat or wide) or column.dtype.kind not in "fiub":
             raise OffbenchError(f"{path}: {name} {column.shape} {column.dtype} does not fit {rows:,} rows")
         if column.nbytes > MAX_COMPRESSION * (path.stat().st_size + 1000):
-            raise OffbenchError(f"{path}: {name} claims {column.nbytes / 1e9:.0f} GB, more than the file can hold")
+            raise OffbenchError(f"{path}: {name} claims {column.nbytes / 1e9:.0f} GB, more than the file can contain")
     if "next_observations" in columns and columns["next_observations"].shape != columns["observations"].shape:
         raise OffbenchError(f"{path}: next_observations {columns['next_observations'].shape} differ from observations")
 

@@ -277,7 +277,7 @@ def _episodes(source: Source, ends: dict[int, tuple[bool, bool]], progress: Prog
             part = {name: values[begin - offset : last + 1 - offset] for name, values in rows.items()}
             where = f"rows {begin} to {last}"
             if not all(np.isfinite(values).all() for values in part.values()):
-                raise OffbenchError(f"{source.path}: {where} hold NaN or infinite numbers; filter them out")
+                raise OffbenchError(f"{source.path}: {where} contain NaN or infinite numbers; filter them out")
             episode = _episode(part, *ends[last], complete)
             if len(episode):
                 empty = False

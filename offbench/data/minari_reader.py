@@ -155,7 +155,7 @@ def finite(array: Array, what: str) -> Array:
     if array.dtype.kind not in "fiub":
         raise OffbenchError(f"{what} are {array.dtype}, not numbers; the dataset is damaged")
     if not np.isfinite(array).all():
-        raise OffbenchError(f"{what} hold NaN or infinite numbers; filter them out of the dataset")
+        raise OffbenchError(f"{what} contain NaN or infinite numbers; filter them out of the dataset")
     return array
 
 
@@ -172,5 +172,5 @@ def float32(array: Array, what: str) -> Array:
 def flags(array: Array, what: str) -> Array:
     """Return zeros and ones as booleans. Raises OffbenchError if there is any other value."""
     if not np.isin(finite(array, what), (0, 1)).all():
-        raise OffbenchError(f"{what} hold values other than 0 and 1; the dataset is damaged")
+        raise OffbenchError(f"{what} contain values other than 0 and 1; the dataset is damaged")
     return array.astype(bool)

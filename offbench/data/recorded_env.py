@@ -71,8 +71,8 @@ def _requirements(metadata: JsonObject) -> list[str]:
 
 def recorded_mujoco(metadata: JsonObject) -> str | None:
     """Return the MuJoCo version that a dataset records, or that a requirement pins; None if unknown."""
-    if made := minari_store.read_provenance(metadata).versions.get("mujoco"):
-        return made
+    if version := minari_store.read_provenance(metadata).versions.get("mujoco"):
+        return version
     pinned = (re.fullmatch(r"mujoco\s*==\s*([\w.]+)", item) for item in _requirements(metadata))
     return next((match[1] for match in pinned if match), None)
 

@@ -170,7 +170,7 @@ def _kwargs(value: object, where: str) -> tuple[tuple[str, object], ...]:
         json.dumps(table)
     except (TypeError, ValueError, RecursionError):  # a date, a number of 5000 digits
         allowed = "numbers, text, true, false, lists and tables"
-        raise OffbenchError(f"{where}: env_kwargs may hold {allowed} only") from None
+        raise OffbenchError(f"{where}: env_kwargs can only contain {allowed}") from None
     return tuple(sorted(table.items()))
 
 

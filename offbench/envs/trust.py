@@ -173,12 +173,12 @@ class _ArgumentChecker:
         elif isinstance(value, str):
             if len(value) > MAX_TEXT_LENGTH or re.search(r"[/\\:\0]", value) or value.startswith((".", "~")):
                 raise OffbenchError(
-                    f"{where} hold {value[:MAX_TEXT_LENGTH]!r}, which may lead to a file or module; {REMEDY}"
+                    f"{where} contain {value[:MAX_TEXT_LENGTH]!r}, which may lead to a file or module; {REMEDY}"
                 )
         elif isinstance(value, int):
             if abs(value) > MAX_ARGUMENT:
                 raise OffbenchError(
-                    f"{where} hold {str(value)[:20]}, and whole numbers may be {MAX_ARGUMENT:,} at most; {REMEDY}"
+                    f"{where} contain {str(value)[:20]}, and whole numbers may be {MAX_ARGUMENT:,} at most; {REMEDY}"
                 )
         elif not isinstance(value, float | None):
-            raise OffbenchError(f"{where} hold a {type(value).__name__}; {REMEDY}")
+            raise OffbenchError(f"{where} contain a {type(value).__name__}; {REMEDY}")

@@ -6,13 +6,13 @@ from offbench.common.provenance import versions
 from offbench.common.terminal import warn
 
 
-def warn_other_physics(what: str, recorded: dict[str, str], env_spec: str) -> None:
+def warn_other_physics(what: str, recorded_versions: dict[str, str], env_spec: str) -> None:
     """Print a warning when `what` was made on a MuJoCo that simulates an environment (EnvSpec JSON) differently."""
-    made, here = recorded.get("mujoco", ""), versions()["mujoco"]
-    if made and not same_physics(made, here, env_spec):
+    recorded_version, here = recorded_versions.get("mujoco", ""), versions()["mujoco"]
+    if recorded_version and not same_physics(recorded_version, here, env_spec):
         warn(
-            f"{what} was made with mujoco {made}, but {here} is installed: the physics differ, so scores may not be "
-            "comparable"
+            f"{what} was made with mujoco {recorded_version}, but {here} is installed: the physics differ, so scores "
+            "may not be comparable"
         )
 
 

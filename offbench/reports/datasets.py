@@ -74,8 +74,8 @@ def _card(env: str) -> Markup | None:
     facts = read_json(card)
     rows = [[Cell(level), *_facts(values)] for level, values in facts["levels"].items()]
     header = ["level", "transitions", "episodes", "mean return", "std", "score", "terminated", "content"]
-    made = ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
-    shown = Table(f"card-{env}", f"{env} ({made})", header, rows)
+    versions = ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
+    shown = Table(f"card-{env}", f"{env} ({versions})", header, rows)
     parts = [table_html(shown, caption=True, download=False)]
     if picture.exists():
         data = base64.b64encode(picture.read_bytes()).decode()

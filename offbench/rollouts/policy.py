@@ -284,7 +284,7 @@ def _check_shapes(p: Policy) -> None:
     if any(a.dtype != np.float32 for a in arrays):
         raise ValueError("every tensor must be float32")
     if not all(np.isfinite(a).all() for a in arrays):
-        raise ValueError("it holds NaN or infinite numbers")
+        raise ValueError("it contains NaN or infinite numbers")
     dim, act = p.observation_mean.shape, p.low.shape
     if any(a.ndim != 1 for a in arrays[:4]) or dim != p.observation_std.shape or act != p.high.shape:
         raise ValueError("the shapes of bounds or normalization do not agree")

@@ -90,8 +90,8 @@ def _versions() -> Iterator[tuple[str, str]]:
 
 
 def _machine() -> Iterator[tuple[str, str]]:
-    made = hardware()
-    processor = f"{made['processor']} ({made['vectors']})"
+    machine = hardware()
+    processor = f"{machine['processor']} ({machine['vectors']})"
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9 if hasattr(os, "sysconf") else 0
     yield OK, f"{platform.platform()}, {processor}, {cores()} of {os.cpu_count()} cores, {memory:.0f} GB memory"
 

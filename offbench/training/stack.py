@@ -130,7 +130,7 @@ class Stack:
                 tensor.copy_(saved)
 
     def diverged(self) -> dict[int, str]:
-        """Return the runs that hold NaN or infinity, each with the name of such a tensor."""
+        """Return the runs that contain NaN or infinity, each with the name of such a tensor."""
         names: dict[int, str] = {}
         for name, tensor in self.tensors().items():
             if tensor.dim():

@@ -136,10 +136,12 @@ def _replay(
         return
     if not chosen or not _same_spaces(spec, data, report, findings):
         return
-    made, here = recorded_mujoco(metadata), versions()["mujoco"]
-    exact = made == here
-    if made is not None and not exact:
-        report.warnings.append(f"recorded with mujoco {made}, but {here} is installed: compared within a tolerance")
+    recorded_version, here = recorded_mujoco(metadata), versions()["mujoco"]
+    exact = recorded_version == here
+    if recorded_version is not None and not exact:
+        report.warnings.append(
+            f"recorded with mujoco {recorded_version}, but {here} is installed: compared within a tolerance"
+        )
     last_unknown = minari_store.read_provenance(metadata).final_observations == "repeated"
     steps = sum(scanned.lengths[i] for i in chosen)
     names = [int(data.episode_indices[i]) for i in chosen]
@@ -173,7 +175,7 @@ def _replay(
             "every termination is exactly at the time limit, where the environment terminates too (episodes played "
             "again show it)"
         )
-    _add_replays(replays, made if exact else None, report, findings)
+    _add_replays(replays, recorded_version if exact else None, report, findings)
 
 
 def _terminates_at(limit: int | None, scanned: ScanResult, i: int) -> bool:

@@ -92,7 +92,7 @@ CASES: dict[str, tuple[str, str]] = {
     "train td3_bc --dataset MEDIUM --hidden 64 64": ("hidden takes lists such as 32,32 64,64", "64,64"),
     "--flag collect hopper": ("unrecognized arguments: --flag (see `offbench --help`)", ""),
     "train bdb --dataset DISCRETE": ("actions must be a Box space, not Discrete(2)", ""),
-    "train bdb --dataset NAN": ("rewards hold NaN or infinite numbers", ""),
+    "train bdb --dataset NAN": ("rewards contain NaN or infinite numbers", ""),
     "train bdb --dataset MEDIUM DISCRETE": ("actions must be a Box space", ""),
     "evaluate nowhere": ("no run or policy file nowhere", ""),
     "evaluate .": ("no run in .", ""),
@@ -231,7 +231,7 @@ RECIPES: dict[str, tuple[str, str]] = {
     "no env": ("dataset_steps = 5", "missing key 'env_id'"),
     "not TOML": ("env_id = ", "not a readable TOML file"),
     "table": ('env_id = "Hopper-v5"\nsac = 3', "sac must be a table"),
-    "name": ('env_id = "Hopper-v5"\nname = "../x"', "name may hold letters"),
+    "name": ('env_id = "Hopper-v5"\nname = "../x"', "name must begin with a letter or digit"),
     "half a reference": ('env_id = "Hopper-v5"\nd4rl_min = 1.0', "both d4rl_min and d4rl_max"),
     "segment": ('env_id = "Hopper-v5"\n[sac]\nsegment = 30\nenvs = 4', "segment must be a multiple of 4"),
     "nothing to learn in": (
@@ -339,7 +339,7 @@ def test_curves_go_into_a_folder_that_is_there(home: Path) -> None:
 def test_a_ladder_never_replaces_other_files(tiny: tuple[str, str], home: Path) -> None:
     (home / "results").mkdir()
     (home / "results" / "thesis.tex").write_text("years of work")
-    with pytest.raises(offbench.OffbenchError, match="holds other files"):
+    with pytest.raises(offbench.OffbenchError, match="contains other files"):
         offbench.behaviour(tiny[0], behaviour_dir=tiny[1], out="results")
     assert (home / "results" / "thesis.tex").read_text() == "years of work"
 

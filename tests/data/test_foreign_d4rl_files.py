@@ -78,7 +78,7 @@ def test_flags_are_zeros_and_ones(name: str, flag: float, right: bool, home: Pat
         import_d4rl(home / "local.hdf5", "p-v0", env="inverted-pendulum")
         assert lengths("p-v0") == [10 if name == "terminals" else 9, 9]  # no next observation at a cut
     else:
-        with pytest.raises(OffbenchError, match=f"{name} hold (values other than 0 and 1|NaN)"):
+        with pytest.raises(OffbenchError, match=f"{name} contain (values other than 0 and 1|NaN)"):
             import_d4rl(home / "local.hdf5", "p-v0", env="inverted-pendulum")
 
 

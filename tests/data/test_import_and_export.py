@@ -312,7 +312,7 @@ SPOILED = {
     "empty": "are not rows of numbers",
     "another file": "rewards is not data of this file",
     "a raw file outside": "rewards is not data of this file",
-    "huge": "more than the file can hold",
+    "huge": "more than the file can contain",
     "next": "differ from observations",
     "{": "metadata is damaged",
     "5": "metadata is damaged",

@@ -108,7 +108,7 @@ def test_a_changed_dataset_is_converted_anew(tiny: tuple[str, str], medium: str)
 
 
 BAD = {
-    "inf": ([episode(3, np.inf, True)], "observations hold NaN or infinite"),
+    "inf": ([episode(3, np.inf, True)], "observations contain NaN or infinite"),
     "no-next": ([episode(3, 0, True, observations=np.zeros((3, 2)))], r"shape \(3, 2\), expected \(4, 2\)"),
     "width": ([episode(3, 0, True, actions=np.zeros((3, 1), np.float32))], r"shape \(3, 1\), expected \(3, 2\)"),
 }
@@ -126,14 +126,14 @@ def planted(name: str, rows: str, values: Any) -> str:
 @pytest.mark.parametrize(
     ("rows", "values", "message"),
     [
-        ("terminations", np.array([0, 0, 0.5]), "terminations hold values other than 0 and 1"),
-        ("terminations", np.array([0, 0, 7]), "terminations hold values other than 0 and 1"),
-        ("terminations", np.array([0, 0, np.nan]), "terminations hold NaN"),
+        ("terminations", np.array([0, 0, 0.5]), "terminations contain values other than 0 and 1"),
+        ("terminations", np.array([0, 0, 7]), "terminations contain values other than 0 and 1"),
+        ("terminations", np.array([0, 0, np.nan]), "terminations contain NaN"),
         ("rewards", np.zeros(3, complex), "rewards are complex128, not numbers"),
         ("rewards", np.zeros(3, [("a", float)]), "rewards are .*, not numbers"),
         ("rewards", np.array([b"a", b"b", b"c"]), r"rewards are .*, not numbers"),
         ("rewards", np.zeros((3, 1)), r"shape \(3, 1\), expected|do not fit"),
-        ("rewards", np.array([0, np.nan, 1]), "rewards hold NaN"),
+        ("rewards", np.array([0, np.nan, 1]), "rewards contain NaN"),
     ],
 )
 def test_rows_of_another_kind_are_neither_trained_on_nor_exported(
