@@ -26,8 +26,8 @@ from offbench.common.terminal import inform, warn
 from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import same_environment
 from offbench.envs.margin_rule import MAX_RULE
+from offbench.envs.physics import warn_other_physics
 from offbench.envs.recipes import Recipe, load_recipe, shipped_recipes
-from offbench.envs.version_warning import warn_other_physics
 from offbench.rollouts.policy import Policy, read_policy_file
 
 BEHAVIOUR = Path("behaviour")  # default folder of all trainings

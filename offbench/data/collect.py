@@ -24,8 +24,8 @@ from offbench.data.other_references import warn_other_references
 from offbench.data.recording import POLICY, WITHOUT_AGENT, Recording
 from offbench.envs.environment_code import environment_code
 from offbench.envs.margin_rule import LAST_WITH_MAX_RULE, MARGIN_KEY, MAX_RULE, MUJOCO_VERSIONS, without_margin
+from offbench.envs.physics import same_physics
 from offbench.envs.recipes import load_recipe
-from offbench.envs.version_warning import same_physics
 from offbench.rollouts.rollouts import Episode
 
 # two recordings with the same values of these metadata, on the same versions of these packages, are the same

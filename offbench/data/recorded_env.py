@@ -14,6 +14,7 @@ from offbench.data import minari_store
 from offbench.envs import environments
 from offbench.envs.environments import Env, untrusted_env
 from offbench.envs.margin_rule import MAX_RULE, MUJOCO_VERSIONS, SUM_RULE, with_margin
+from offbench.envs.physics import margins_matter
 from offbench.envs.recipes import load_recipe, shipped_recipes
 
 # a clause of a requirement: `>=3.1.0,<3.2.0` has two
@@ -80,11 +81,7 @@ def recorded_mujoco(metadata: JsonObject) -> str | None:
 def report_margin_rule(dataset_id: str, metadata: JsonObject, env_spec: str) -> None:
     """Print the contact-margin rule of a dataset's environment (EnvSpec JSON), unless it is the default or unused."""
     rule = recorded_margin(metadata)
-    if rule == MAX_RULE:
-        return
-    from offbench.envs.contact_margins import margins_matter  # imports MuJoCo, which is slow to load
-
-    if not margins_matter(env_spec):
+    if rule == MAX_RULE or not margins_matter(env_spec):
         return
     since, installed = MUJOCO_VERSIONS[rule or MAX_RULE], versions()["mujoco"]
     message = f"{dataset_id}: contact margins as in MuJoCo {since} ({installed} is installed)"

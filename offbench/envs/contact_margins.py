@@ -28,7 +28,6 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.terminal import warn
-from offbench.envs.environments import make_env
 from offbench.envs.margin_rule import MAX_RULE, MUJOCO_VERSIONS, SUM_RULE
 
 SUMMED_SINCE, GAP_OUTSIDE_SINCE, RK4_ROTATIONS_SINCE = (3, 5), (3, 9), (4, 0)
@@ -71,14 +70,6 @@ def set_contacts(model: mujoco.MjModel, rule: str, name: str) -> None:
 def has_margins(model: mujoco.MjModel) -> bool:
     """Return whether the rule makes a difference for a model."""
     return bool(model.geom_margin.any() or model.geom_gap.any())
-
-
-def margins_matter(env_spec: str) -> bool:
-    """Return whether the rule for contact margins makes a difference in an environment (EnvSpec JSON)."""
-    env = make_env(env_spec)
-    model = model_of(env)
-    env.close()
-    return model is not None and has_margins(model)
 
 
 @functools.cache

@@ -23,6 +23,7 @@ from offbench.common.scores import are_references
 from offbench.common.settings import build, setting, short_repr
 from offbench.envs.environments import PASSIVE_WRAPPERS, RENDERING_ARGUMENTS, env_spec
 from offbench.envs.margin_rule import MARGIN_KEY, MAX_RULE, SUM_RULE, with_margin
+from offbench.envs.physics import margins_matter
 
 T = TypeVar("T")
 
@@ -226,7 +227,5 @@ def d4rl_reference_of_env(env_spec: str | None) -> tuple[float, float] | None:
         and wrappers <= PASSIVE_WRAPPERS
     )
     if standard and fields.get(MARGIN_KEY) == SUM_RULE:
-        from offbench.envs.contact_margins import margins_matter  # imports MuJoCo, which is slow to load
-
         standard = not margins_matter(str(env_spec))
     return (recipe.d4rl_min, recipe.d4rl_max) if standard else None

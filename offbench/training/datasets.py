@@ -13,7 +13,7 @@ from offbench.data.recorded_env import report_margin_rule
 from offbench.data.transitions import Transitions
 from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import check_spec
-from offbench.envs.version_warning import warn_other_physics
+from offbench.envs.physics import warn_other_physics
 from offbench.training.spec import RunSpec
 
 Datasets = Mapping[str, Transitions]

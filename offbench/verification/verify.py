@@ -24,9 +24,9 @@ from offbench.data import minari_store
 from offbench.data.file_stamps import unchanged
 from offbench.data.minari_reader import RecordedEpisode, episodes_of, open_minari, reading
 from offbench.data.recorded_env import recorded_margin, recorded_mujoco
-from offbench.envs.contact_margins import margins_matter
 from offbench.envs.environments import box, parse_spec, same_bounds, time_limit, untrusted_env
 from offbench.envs.margin_rule import MAX_RULE, MUJOCO_VERSIONS, SUM_RULE, with_margin
+from offbench.envs.physics import margins_matter
 from offbench.rollouts.rollouts import Rollouts, result
 from offbench.verification.findings import Findings, Report
 from offbench.verification.metadata import check_recorded_metadata

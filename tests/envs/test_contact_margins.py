@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from offbench.envs import version_warning
+from offbench.envs import physics
 from offbench.envs.contact_margins import GAP_OUTSIDE_SINCE, SUMMED_SINCE, release, rotations_changed, set_contacts
 from offbench.envs.margin_rule import MAX_RULE, SUM_RULE
 from offbench.envs.recipes import load_recipe
@@ -154,12 +154,12 @@ def test_margins_that_nothing_restores_are_left_alone_and_said(capsys: pytest.Ca
 def test_only_a_rotating_environment_warns_of_another_physics(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(version_warning, "versions", lambda: {"mujoco": "4.0.0"})
+    monkeypatch.setattr(physics, "versions", lambda: {"mujoco": "4.0.0"})
     hopper, ant = (load_recipe(name).env_spec() for name in ("hopper", "ant"))
     for spec, version in ((hopper, "3.4.0"), (hopper, "3.10.0"), (ant, "4.1.0")):
-        version_warning.warn_other_physics("it", {"mujoco": version}, spec)
+        physics.warn_other_physics("it", {"mujoco": version}, spec)
     assert not capsys.readouterr().err
-    version_warning.warn_other_physics("the ant's data", {"mujoco": "3.4.0"}, ant)
+    physics.warn_other_physics("the ant's data", {"mujoco": "3.4.0"}, ant)
     said = capsys.readouterr().err
     assert all(word in said for word in ("the ant's data", "3.4.0", "4.0.0"))
     assert not rotations_changed(boxes([0.0]))  # Euler's integrator

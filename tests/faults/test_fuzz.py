@@ -35,8 +35,8 @@ from offbench.data import minari_store
 from offbench.data.import_d4rl import import_d4rl
 from offbench.data.show import Summary
 from offbench.data.transitions import Transitions
+from offbench.envs.physics import warn_other_physics
 from offbench.envs.recipes import load_recipe, read_recipe, recipes_folder
-from offbench.envs.version_warning import warn_other_physics
 from offbench.rollouts.policy import Policy, read_policy_file
 from offbench.training.run import Run
 from tests.data.test_import_and_export import d4rl_file
