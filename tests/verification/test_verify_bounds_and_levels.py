@@ -62,6 +62,10 @@ def swap_returns(parts: list[JsonObject]) -> None:
     swap(parts, "return", "interval", "fraction")
 
 
+def lower_the_experts_return(parts: list[JsonObject]) -> None:
+    parts[1] |= {"return": parts[0]["return"] - 1e-3, "fraction": parts[0]["fraction"]}
+
+
 def swap_fractions(parts: list[JsonObject]) -> None:
     swap(parts, "fraction")
 
@@ -74,6 +78,7 @@ def change_a_fraction(parts: list[JsonObject]) -> None:
     ("edit", "where"),
     [
         (swap_returns, "metadata"),
+        (lower_the_experts_return, "metadata"),
         (swap_fractions, "part medium, part expert"),
         (change_a_fraction, "part expert"),
     ],
@@ -98,3 +103,11 @@ def test_a_medium_level_as_good_as_the_expert(medium: str) -> None:
     change_metadata(medium, parts=[provenance.parts[0] | {"return": best, "fraction": 1.0}])
     found = {finding.code: finding.where for finding in verify(medium, workers=1, episodes=0).findings}
     assert found["level-order"] == "metadata"
+
+
+def test_a_random_reference_above_the_experts(medium: str) -> None:
+    references = minari_store.read_provenance(minari_store.read_metadata(medium)).references
+    random = references["random"] | {"return": 2 * references["expert"]["return"]}
+    change_metadata(medium, references=references | {"random": random})
+    found = {finding.code: finding.where for finding in verify(medium, workers=1, episodes=0).findings}
+    assert found["level-order"] == "metadata, part medium"  # which is a fraction of the distance between the two
