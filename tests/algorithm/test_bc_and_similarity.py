@@ -50,22 +50,27 @@ def test_bc_clones_the_data_and_top_the_best_of_it() -> None:
 
 
 def test_similar_score_by_hand(medium: str) -> None:
+    """Of samples that another seed draws, the scores are others."""
     (folder,) = offbench.train("td3_bc", medium, steps=300, **SMALL)
-    score = similarity(folder, samples=400, tolerance=0.02, action_tolerance=0.3)
-    assert json.loads((folder / "similarity.json").read_text()) == dataclasses.asdict(score)
     stack, data = restore(Run(folder)), offbench.load(medium)
-    rng = np.random.default_rng(np.random.SeedSequence([0, 11]))
-    chosen = rng.integers(len(data), size=(1, 400))[0]
-    states, actions = data.observations[data.rows[chosen]], data.actions[chosen]
-    pi = read_policy_file(folder / "policy.safetensors").act(states, None) / 3  # the pendulum's actions span [-3, 3]
-    mean, std = data.normalizer()
-    inputs = torch.from_numpy((states - mean) / std).unsqueeze(0)
     critic: Any = stack.algorithm.learned["critic"]
-    q_pi, q = (critic(inputs, torch.from_numpy(a).unsqueeze(0))[0, 0].detach().numpy() for a in (pi, actions))
-    assert score.q_similar == pytest.approx(100 * np.mean(np.abs(q_pi - q) <= 0.02 * np.abs(q)), abs=0.3)
-    distance = np.sqrt(((pi - actions) ** 2).mean(1))
-    assert score.action_similar == pytest.approx(100 * np.mean(distance <= 0.3), abs=0.3)
-    assert 0 < score.action_similar < 100
+    policy, (mean, std) = read_policy_file(folder / "policy.safetensors"), data.normalizer()
+    found = []
+    for seed in (0, 5):
+        score = similarity(folder, samples=400, tolerance=0.02, action_tolerance=0.3, seed=seed)
+        assert json.loads((folder / "similarity.json").read_text()) == dataclasses.asdict(score)
+        rng = np.random.default_rng(np.random.SeedSequence([seed, 11]))
+        chosen = rng.integers(len(data), size=(1, 400))[0]
+        states, actions = data.observations[data.rows[chosen]], data.actions[chosen]
+        pi = policy.act(states, None) / 3  # the pendulum's actions span [-3, 3]
+        inputs = torch.from_numpy((states - mean) / std).unsqueeze(0)
+        q_pi, q = (critic(inputs, torch.from_numpy(a).unsqueeze(0))[0, 0].detach().numpy() for a in (pi, actions))
+        assert score.q_similar == pytest.approx(100 * np.mean(np.abs(q_pi - q) <= 0.02 * np.abs(q)), abs=0.3)
+        distance = np.sqrt(((pi - actions) ** 2).mean(1))
+        assert score.action_similar == pytest.approx(100 * np.mean(distance <= 0.3), abs=0.3)
+        assert 0 < score.action_similar < 100
+        found.append(score)
+    assert abs(found[0].action_similar - found[1].action_similar) > 1  # more than the tolerance of both
 
 
 def test_similarity_on_the_command_line(medium: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import sysconfig
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -188,10 +189,15 @@ def test_every_kind_that_acts_by_itself(kind: str, activation: str, home: Path, 
     assert json.loads(origin.value) == {"env_id": "X-v0", "kind": kind, "origin": {}}
 
 
-def test_policies_that_act_by_chance_are_refused(home: Path) -> None:
-    uniform_policy(-np.ones(1, np.float32), np.ones(1, np.float32), 4, "X-v0").save(home / "random.safetensors")
+@pytest.mark.parametrize(("kind", "reason"), [("uniform", "is random"), ("best_by_q", "chooses among random actions")])
+def test_policies_that_act_by_chance_are_refused(kind: str, reason: str, home: Path) -> None:
+    one, actor, critic = (np.ones(shape, np.float32) for shape in (1, (4, 2), (5, 1)))
+    policy = replace(uniform_policy(-one, one, 4, "X-v0"), kind=kind)
+    if kind == "best_by_q":
+        policy = replace(policy, layers=((actor, actor[0]),), critic=((critic, one),), samples=3)
+    policy.save(home / "random.safetensors")
     for name in ("policy.pt", "policy.onnx"):
-        with pytest.raises(OffbenchError, match="is random"):
+        with pytest.raises(OffbenchError, match=reason):
             export_policy(home / "random.safetensors", home / name)
         assert not (home / name).exists()
 

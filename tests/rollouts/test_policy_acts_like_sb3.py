@@ -11,6 +11,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 from stable_baselines3 import SAC
+from torch import nn
 
 from offbench.agents.sac import export_actor
 from offbench.common.errors import OffbenchError
@@ -38,6 +39,38 @@ def test_sampled_actions_equal_sb3_given_its_noise(sac: SAC, rng: np.random.Gene
         theirs = torch.tanh(mean + log_std.exp() * noise)
     ours = export_actor(sac, "Hopper-v5", {}).act(observations, noise.numpy())
     np.testing.assert_allclose(ours, theirs.numpy(), atol=1e-5)
+
+
+def test_the_log_std_is_clipped_as_sb3_clips_it() -> None:
+    """At 5 and -30, beyond both bounds; the noise is such that tanh tells e^2 from e^5 and e^-20 from e^-30."""
+    sac = SAC("MlpPolicy", gym.make("Hopper-v5"), policy_kwargs={"net_arch": [8]}, buffer_size=10)
+    actor = sac.policy.actor
+    with torch.no_grad():
+        actor.log_std.weight.zero_()
+        actor.log_std.bias.copy_(torch.tensor([5.0, -30.0, 0.0]))
+        mean, log_std, _ = actor.get_action_dist_params(torch.zeros(1, 11))
+        noise = torch.tensor([[0.05, 2e8, 0.5]])
+        theirs = torch.tanh(mean + log_std.exp() * noise).numpy()
+    ours = export_actor(sac, "Hopper-v5", {}).act(np.zeros((1, 11)), noise.numpy())
+    np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+def test_best_by_q_normalizes_what_actor_and_critic_see(rng: np.random.Generator) -> None:
+    torch.manual_seed(0)
+    actor, critic = (nn.Sequential(nn.Linear(n, 16), nn.ReLU(), nn.Linear(16, out)) for n, out in ((4, 4), (6, 1)))
+    nets = [
+        tuple((m.weight.detach().numpy().T, m.bias.detach().numpy()) for m in (n[0], n[2])) for n in (actor, critic)
+    ]
+    one, std = np.ones(2, np.float32), np.full(4, 0.2, np.float32)
+    policy = Policy("best_by_q", nets[0], std * 15, std, -one, one, "X-v0", critic=nets[1], samples=6)
+    observations, noise = rng.normal(3, 0.2, (50, 4)), rng.normal(size=(50, 6, 2))
+    with torch.no_grad():
+        x = torch.as_tensor((observations - 3) / 0.2, dtype=torch.float32)
+        mean, log_std = actor(x)[:, None].chunk(2, -1)
+        actions = torch.tanh(mean + log_std.exp() * torch.as_tensor(noise, dtype=torch.float32))
+        best = critic(torch.cat([x[:, None].expand(50, 6, 4), actions], -1)).argmax(1)[:, 0]
+    theirs = actions[torch.arange(50), best].numpy()
+    np.testing.assert_allclose(policy.act(observations, noise), theirs, atol=1e-5)
 
 
 def test_actions_do_not_depend_on_how_many_are_asked_for(sac: SAC, rng: np.random.Generator) -> None:
