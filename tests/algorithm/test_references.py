@@ -32,7 +32,7 @@ RATES = {"actor_learning_rate": 1e-3, "critic_learning_rate": 5e-4}
 TARGETS = {"discount": 0.9, "tau": 0.02}
 TD3 = {**RATES, **TARGETS, "policy_noise": 0.3, "noise_clip": 0.1, "policy_freq": 3}
 DISCRIMINATOR = {"discriminator_learning_rate": 2e-3, "discriminator_hidden": (24,)}
-VAE = {"vae_hidden": (16, 16), "match_samples": 2, "target_samples": 3}
+VAE = {"vae_hidden": (24, 20), "match_samples": 2, "target_samples": 3}
 
 Settings = dict[str, Any]
 CASES: dict[str, tuple[int, Settings, list[Settings]]] = {  # number of updates, settings of both runs, and of each
@@ -40,13 +40,13 @@ CASES: dict[str, tuple[int, Settings, list[Settings]]] = {  # number of updates,
     "td3_bc": (200, {}, [{"alpha": 2.5}, {"alpha": 1.0}]),
     "td3_bc, other settings": (60, TD3, [{"alpha": 2.5}, {"alpha": 1.0}]),
     "bdb": (200, {}, [{"beta": 0.3}, {"beta": "adaptive"}]),
-    "bdb, four critics": (200, {"critics": 4}, [{"beta": 1.0}, {"beta": "adaptive"}]),
+    "bdb, four critics": (60, {"critics": 4}, [{"beta": 1.0}, {"beta": "adaptive"}]),
     "bdb, other settings": (
         60,
         {**TD3, **DISCRIMINATOR, "beta_scope": "batch", "critics": 3},
         [{"beta": 0.6, "alpha": 1.0}, {"beta": "adaptive"}],
     ),
-    "bdb_plus": (60, {}, [{"beta": "learned", "beta_target": 0.3}, {"beta": "learned", "beta_max": 0.4}]),
+    "bdb_plus": (60, {}, [{"beta": "learned", "beta_target": 2.0}, {"beta": "learned", "beta_max": 0.4}]),
     "bdb_plus, other settings": (
         60,
         {**TD3, **DISCRIMINATOR, "beta_scope": "batch", "critics": 3, "beta_learning_rate": 5e-3}
@@ -160,6 +160,23 @@ def test_an_algorithm_follows_its_float64_reference(case: str) -> None:
         assert values[1] < -0.01  # held from both sides
     if case == "iql, other settings":
         assert references[0].limited  # weights of single samples reached their limit
+
+
+@pytest.mark.parametrize("case", ["bc", *(case for case in CASES if case.endswith("other settings"))])
+def test_networks_and_noise_have_the_sizes_of_the_settings(case: str) -> None:
+    """The references take these sizes from the stack."""
+    stack, (c, _), _ = make(case)
+    hidden = dict.fromkeys(("actor", "critic", "value"), "hidden") | {"discriminator": "discriminator_hidden"}
+    for name, setting in (hidden | {"encoder": "vae_hidden", "decoder": "vae_hidden"}).items():
+        for network in networks(getattr(stack, name), 0) if hasattr(stack, name) else []:
+            widths = [layer.out_features for layer in network.children() if isinstance(layer, nn.Linear)]
+            assert tuple(widths[:-1]) == getattr(c, setting), name
+    if hasattr(stack, "critic"):
+        assert len(networks(stack.critic, 0)) == getattr(c, "critics", 2)
+    samples = {"penalty_actions": ["uniform"], "num_actions": ["here", "there", "uniform"]}
+    for setting, names in (samples | {"match_samples": ["data", "actor"], "target_samples": ["target"]}).items():
+        for name in names if hasattr(c, setting) else []:
+            assert stack.noise_spec(stack.config)[name].shape[:2] == (getattr(c, setting), BATCH), name
 
 
 @pytest.mark.parametrize("name", algorithm_names())
