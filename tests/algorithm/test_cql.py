@@ -42,7 +42,8 @@ def a_batch(act: int = ACT, batch: int = BATCH, seed: int = 0) -> Batch:
     def normal(*shape: int) -> Tensor:
         return torch.randn((1, batch, *shape), generator=generator)
 
-    return Batch(normal(OBS), normal(act).tanh(), normal(), normal(OBS), torch.ones(1, batch))
+    parts = normal(OBS), normal(act).tanh(), normal(), normal(OBS)
+    return Batch(*parts, (torch.rand(1, batch, generator=generator) > 0.2).float())
 
 
 def test_log_density_equals_pytorchs_distribution() -> None:
@@ -133,17 +134,30 @@ def test_the_critic_step_gives_the_actor_no_gradient() -> None:
 
 
 def test_no_entropy_in_the_target() -> None:
-    """y = r + discount min Q'(s', a'), computed here by hand."""
+    """y = r + discount (1 - terminated) min Q'(s', a'), computed here by hand."""
     algorithm, batch = make(alpha=0.0), a_batch()
     noise = noise_for(algorithm)
     with torch.no_grad():
         actions, _ = sample(algorithm.actor, batch.next_observations, noise["target"])
         q = algorithm.critic.frozen(batch.next_observations, actions[:, 0])
-        y = batch.rewards + 0.99 * torch.minimum(q[0], q[1])
+        y = batch.rewards + 0.99 * batch.masks * torch.minimum(q[0], q[1])
         now = algorithm.critic.frozen(batch.observations, batch.actions)
         expected = ((now[0] - y) ** 2).mean() + ((now[1] - y) ** 2).mean()
     loss, _ = algorithm.critic_loss(batch, noise, torch.ones(1), algorithm.config)
     torch.testing.assert_close(loss[0], expected)
+
+
+def test_cql_does_not_bootstrap_from_terminal_states() -> None:
+    """Only where no transition is terminal do the next observations matter."""
+    algorithm, batch = make(alpha=0.0), a_batch()
+    for masks, same in ((torch.zeros_like(batch.masks), True), (torch.ones_like(batch.masks), False)):
+        losses = []
+        for shift in (0.0, 3.0):
+            moved = batch._replace(masks=masks, next_observations=batch.next_observations + shift)
+            losses.append(
+                algorithm.critic_loss(moved, noise_for(algorithm), torch.ones(1), algorithm.config)[0].item()
+            )
+        assert (losses[0] == losses[1]) == same
 
 
 def test_the_temperature_moves_towards_the_target_entropy() -> None:

@@ -14,8 +14,8 @@ from offbench.algorithm import Batch, Logs, Network, Noise, NoiseSpec, cosine_de
 from offbench.common.errors import OffbenchError
 from offbench.training.batches import StackData
 from offbench.training.spec import RunSpec
+from tests.algorithm.references import networks
 from tests.algorithm.test_cpu_capture import Plain, stack_of, trained
-from tests.algorithm.test_references import networks
 from tests.data.test_transitions import episode, foreign
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -149,6 +150,23 @@ def test_adaptive_beta_is_one_over_the_spread_of_the_critics() -> None:
     algorithm.config.beta_scope = "batch"
     logs = algorithm.actor_loss(batch, pi, algorithm.config)
     torch.testing.assert_close(logs["beta"], (1 / spread.mean(-1)).clamp(max=1))
+
+
+@pytest.mark.parametrize("name", ["bdb", "bdb_plus"])
+def test_bdb_logs_the_quantiles_of_beta(name: str) -> None:
+    algorithm = make(name, [{}, {}])
+    with torch.no_grad():
+        algorithm.critic.flat *= 4
+    batch, _ = next(batches(1, runs=2))
+    pi = algorithm.actor(batch.observations).tanh()
+    q = algorithm.critic(batch.observations, pi).detach().numpy()
+    beta = np.minimum(1, 1 / abs(q[0] - q[1]))  # [runs, batch]
+    logs = algorithm.actor_loss(batch, pi, algorithm.config)
+    for percent in (5, 50, 95):
+        expected = np.quantile(beta, percent / 100, axis=1, method="nearest")
+        np.testing.assert_allclose(logs[f"beta_{percent}"].numpy(), expected, rtol=1e-4)
+    assert (logs["beta_5"] < logs["beta_50"]).all()
+    assert (logs["beta_50"] < logs["beta_95"]).all()
 
 
 def test_what_bdb_logs() -> None:
