@@ -22,6 +22,7 @@ from offbench.training.loggers import LoggerOptions, Loggers
 from offbench.training.run import Run
 from tests.made_runs import made_run
 
+REFERENCES = ([-20.0, 230.0], [-10.0, 190.0])  # of a made run: its dataset's, D4RL's
 SIZES: dict[str, Any] = {"hidden": (8,), "batch_size": 8, "eval_episodes": 2, "workers": 1}
 
 
@@ -77,7 +78,7 @@ def test_event_files_hold_what_the_run_holds(medium: str) -> None:
 def test_the_scores_of_event_files_are_by_the_runs_own_references(home: Path) -> None:
     """In a run whose lengths are not its returns."""
     pytest.importorskip("tensorboard")
-    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, steps=12_000)
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, steps=12_000, references=REFERENCES)
     with Loggers([run], LoggerOptions(tensorboard=True)) as views:
         views.write(0, run.losses(), run.evaluations())
     check_events(run)
@@ -165,7 +166,7 @@ def show(run: Run, until: int) -> None:
 
 
 def test_wandb_gets_every_step_once_over_two_processes(fake_wandb: list[FakeRun], home: Path) -> None:
-    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, steps=12_000)
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, steps=12_000, references=REFERENCES)
     for until in (5000, 8000, 3000, 12_001):  # the third went back to an older checkpoint
         show(run, until)
     assert len({fake.arguments["id"] for fake in fake_wandb}) == 1
