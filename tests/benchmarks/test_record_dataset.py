@@ -62,7 +62,8 @@ def test_a_dataset_that_another_process_finishes_is_taken(medium: str, monkeypat
     assert minari_store.read_metadata(MINE.id)["total_steps"] == 600
 
 
-def test_an_error_is_raised_where_nobody_records() -> None:
+def test_an_error_is_raised_where_nobody_records(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(datasets, "time", SimpleNamespace(sleep=lambda _: pytest.fail("it waits")))
     with pytest.raises(OffbenchError, match=r"no recipe file .*gone\.toml"):
         record_dataset(GridDataset("mine-v0", "./gone.toml", "random", steps=100), 1)
 
