@@ -20,6 +20,7 @@ from offbench.benchmarks import ray_executor
 from offbench.benchmarks.benchmark import benchmark
 from offbench.benchmarks.grid import load_grid
 from offbench.benchmarks.plan import prepare
+from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.training.devices import Machine
 from offbench.training.jobs import train_job
@@ -81,6 +82,7 @@ def test_a_lost_node_changes_nothing(two_nodes: Any, home: Path) -> None:
     nodes, workers = two_nodes
     assert run("local", None)
     executor = ray_executor.RayExecutor(nodes.address, slice_seconds=2)
+    assert executor.cpus == 2
     with ThreadPoolExecutor(1) as beside:  # Ray starts and ends its nodes in the main thread alone
         over = beside.submit(run, "ray", executor)
         while not any((home / "ray").rglob("checkpoint-*")) and not over.done():
@@ -199,6 +201,27 @@ def test_an_algorithm_of_ones_own_is_sent_to_the_nodes(
     monkeypatch.setattr(sys.modules["losses"], "checked", fails)
     with pytest.raises(OffbenchError, match=r'(?s)algo.py", line 8, in update.*ZeroDivisionError'):
         run("ray", ray_executor.RayExecutor(nodes.address))
+
+
+def test_the_command_line_trains_on_a_cluster(
+    two_nodes: Any, home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With a worker for each of the cluster's processors, and the bits of this machine."""
+    nodes, _ = two_nodes
+    assert run("local", None)
+    asked: list[int] = []
+    train = ray_executor.RayExecutor.train
+
+    def noted(self: ray_executor.RayExecutor, jobs: Any, processes: int) -> list[str]:
+        asked.append(processes)
+        return train(self, jobs, processes)
+
+    monkeypatch.setattr(ray_executor.RayExecutor, "train", noted)
+    words = ["--address", nodes.address, "--runs", "ray", "--stack", "1", "--device", "cpu"]
+    main(["benchmark", "./grid.toml", "--executor", "ray", *words])
+    assert asked == [2]
+    same(home, "local", "ray")
+    assert "next: offbench report --runs ray" in capsys.readouterr().err
 
 
 def test_what_fails_on_a_node_is_said_here(two_nodes: Any, home: Path) -> None:

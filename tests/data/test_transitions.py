@@ -217,7 +217,9 @@ def test_numbers_beyond_float32_are_called_that(column: str, value: float, recwa
     large[1] = value
     foreign("large-v0", [sound | {column: large}])
     if abs(value) < 3e38:
-        offbench.load("large-v0")
+        data = offbench.load("large-v0")
+        column_of = {"observations": data.observations[1, 0], "rewards": data.rewards[1]}
+        assert column_of[column] == np.float32(value)
         return
     with pytest.raises(OffbenchError, match=rf"{column} reach .*beyond float32's 3.4e\+38; scale them") as error:
         offbench.load("large-v0")

@@ -173,9 +173,13 @@ def test_ctrl_c_while_the_program_starts(home: Path) -> None:
     assert (ended.returncode, ended.stderr) == (130, b"")
 
 
-def test_a_completion_without_its_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_completion_without_its_line(
+    medium: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command runs, as without the variable."""
     monkeypatch.setenv("_ARGCOMPLETE", "1")
     main(["list", "datasets"])
+    assert medium in capsys.readouterr().out
 
 
 def spec_of(**changes: Any) -> str:

@@ -13,7 +13,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import offbench
@@ -23,6 +22,7 @@ from offbench.training.loggers import LoggerOptions, Loggers
 from offbench.training.run import Run
 from tests.made_runs import made_run
 
+REFERENCES = ([-20.0, 230.0], [-10.0, 190.0])  # of a made run: its dataset's, D4RL's
 SIZES: dict[str, Any] = {"hidden": (8,), "batch_size": 8, "eval_episodes": 2, "workers": 1}
 
 
@@ -50,9 +50,22 @@ def check_events(run: Run) -> None:
             expected = [(int(row["step"]), float(row[name])) for row in rows if row[name]]
             assert [step for step, _ in found[f"losses/{name}"]] == [step for step, _ in expected]
             assert found[f"losses/{name}"] == [(step, pytest.approx(value, rel=1e-4)) for step, value in expected]
-    means = {step: np.mean([value for value, _ in rows]) for step, rows in run.evaluations().items()}
-    assert found["evaluation/return"] == [(step, pytest.approx(mean)) for step, mean in means.items()]
-    assert {"evaluation/score", "evaluation/length"} <= set(found)
+    for name, values in evaluations_by_hand(run).items():
+        assert found[name] == [(step, pytest.approx(value, rel=1e-5)) for step, value in values.items()]
+
+
+def evaluations_by_hand(run: Run) -> dict[str, dict[int, float]]:
+    """Return each evaluation's mean return, length and score by step, from evaluations.csv and config.json."""
+    with open(run.evaluations_path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    low, high = json.loads(run.config_path.read_text())["references"]["dataset"]
+    means: dict[str, dict[int, float]] = {"evaluation/return": {}, "evaluation/length": {}, "evaluation/score": {}}
+    for step in sorted({int(row["step"]) for row in rows}):
+        episodes = [row for row in rows if int(row["step"]) == step]
+        for name in ("return", "length"):
+            means[f"evaluation/{name}"][step] = sum(float(row[name]) for row in episodes) / len(episodes)
+        means["evaluation/score"][step] = 100 * (means["evaluation/return"][step] - low) / (high - low)
+    return means
 
 
 def test_event_files_hold_what_the_run_holds(medium: str) -> None:
@@ -60,6 +73,15 @@ def test_event_files_hold_what_the_run_holds(medium: str) -> None:
     folders = offbench.train("td3_bc", medium, seeds=range(2), steps=60, eval_every=20, tensorboard=True, **SIZES)
     for folder in folders:
         check_events(Run(folder))
+
+
+def test_the_scores_of_event_files_are_by_the_runs_own_references(home: Path) -> None:
+    """In a run whose lengths are not its returns."""
+    pytest.importorskip("tensorboard")
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, steps=12_000, references=REFERENCES)
+    with Loggers([run], LoggerOptions(tensorboard=True)) as views:
+        views.write(0, run.losses(), run.evaluations())
+    check_events(run)
 
 
 def test_a_longer_training_shows_every_step_once(medium: str) -> None:
@@ -144,7 +166,7 @@ def show(run: Run, until: int) -> None:
 
 
 def test_wandb_gets_every_step_once_over_two_processes(fake_wandb: list[FakeRun], home: Path) -> None:
-    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, steps=12_000)
+    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50, steps=12_000, references=REFERENCES)
     for until in (5000, 8000, 3000, 12_001):  # the third went back to an older checkpoint
         show(run, until)
     assert len({fake.arguments["id"] for fake in fake_wandb}) == 1
@@ -152,7 +174,9 @@ def test_wandb_gets_every_step_once_over_two_processes(fake_wandb: list[FakeRun]
     assert fake_wandb[0].arguments["name"] == "hopper-medium-v0/td3_bc/default/seed-0"
     seen = Counter((row["step"], key) for fake in fake_wandb for row in fake.rows for key in row if key != "step")
     assert set(seen.values()) == {1}
-    assert {step for step, key in seen if key == "evaluation/score"} == set(run.evaluations())
+    for name, values in evaluations_by_hand(run).items():
+        sent = {row["step"]: row[name] for fake in fake_wandb for row in fake.rows if name in row}
+        assert sent == pytest.approx(values)
     assert {step for step, key in seen if key == "losses/q_abs"} == {int(row["step"]) for row in run.losses()}
     assert fake_wandb[2].rows == []
 
