@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from offbench.benchmarks import plan
 from offbench.benchmarks.plan import Cost, prepare, write_plan
 from offbench.benchmarks.throughput import Rate
 from offbench.envs.recipes import load_recipe
+from offbench.training.devices import Machine
 from offbench.training.registry import load_algorithm
 from offbench.training.spec import RunSpec
 from tests.benchmarks.test_benchmark import GRID
@@ -37,7 +39,12 @@ def test_a_plan_adds_up_time_and_disk_space(home: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(plan, "_bytes_per_step", lambda _: 50)
     costs: list[Cost] = []
     totals = plan._totals
-    monkeypatch.setattr(plan, "_totals", lambda found, machine: costs.extend(found) or totals(found, machine))
+
+    def noted(found: list[Cost], machine: Machine) -> Iterator[str]:
+        costs.extend(found)
+        return totals(found, machine)
+
+    monkeypatch.setattr(plan, "_totals", noted)
     (home / "grid.toml").write_text(GRID.replace('"DATASET"', MISSING))
     lines: list[str] = []
     update_seconds = write_plan(prepare("./grid.toml", workers=2, device="cpu"), say=lines.append)

@@ -21,6 +21,7 @@ from offbench.benchmarks.datasets import record_dataset
 from offbench.benchmarks.grid import GridDataset
 from offbench.benchmarks.plan import prepare
 from offbench.common.errors import OffbenchError
+from offbench.common.files import exclusive_lock
 from offbench.data import minari_store
 from tests.benchmarks.test_benchmark import GRID, silent
 
@@ -30,7 +31,7 @@ MINE = GridDataset("mine-v0", "inverted-pendulum", "random", steps=100)
 @contextmanager
 def recording_meanwhile(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Hold the lock of the dataset, and yield while a call that records it waits beside."""
-    lock, waiting, go_on = minari_store.exclusive_lock, Event(), Event()
+    lock, waiting, go_on = exclusive_lock, Event(), Event()
 
     def sleep(seconds: float) -> None:
         assert seconds == datasets.WAIT

@@ -47,7 +47,7 @@ OF_THE_OUTPUT = {
 }
 
 
-class Calls(list[tuple[str, dict[str, Any]]]):
+class Calls(list[tuple[str, dict[Any, Any]]]):
     """The calls of the functions that are replaced: name and arguments, with whether files are trusted."""
 
     def stand_in(self, name: str, stop: bool = True) -> Callable[..., Any]:
@@ -79,7 +79,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
     return found
 
 
-def called(line: list[str], calls: Calls) -> tuple[str, dict[str, Any]]:
+def called(line: list[str], calls: Calls) -> tuple[str, dict[Any, Any]]:
     """Run a command; return the name of the last function called, and the arguments of all."""
     calls.clear()
     with pytest.raises(SystemExit):
@@ -102,7 +102,7 @@ def test_every_option_reaches_the_function(command: str, calls: Calls) -> None:
     example = shlex.split(BY_NAME[command].examples[0])
     if command == "train":
         example = shlex.split("train bdb_plus --dataset hopper-medium-v0")
-    for action in _parser(example)._subparsers._group_actions[0].choices[command]._actions:  # type: ignore[union-attr]
+    for action in _parser(example)._subparsers._group_actions[0].choices[command]._actions:  # type: ignore[index, union-attr]
         option = (command, action.dest)
         if not action.option_strings or action.dest == "help" or option in OF_THE_OUTPUT:
             continue
