@@ -143,7 +143,7 @@ def test_every_page_is_in_the_sites_contents() -> None:
 
 def test_ci_calls_the_readmes_two_commands() -> None:
     ci = (ROOT / ".ci" / "run").read_text().splitlines()
-    assert {"make demo", "make test", "make docs"} <= set(ci)
+    assert {"STEPS=2000 make demo", "make test", "make docs"} <= set(ci)
     assert any(b.content == "make demo\nmake test\n" for b in blocks(ROOT / "README.md"))
 
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 
 from offbench.benchmarks.grid import GridDataset
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import LockedError, OffbenchError
 from offbench.common.files import JsonObject
 from offbench.data import minari_store
 from offbench.data.collect import collect
@@ -32,11 +32,11 @@ def record_dataset(dataset: GridDataset, workers: int) -> None:
                 workers=workers,
                 dataset_id=dataset.id,
             )
-        except OffbenchError:
-            # another process records it, or has just finished
-            if not minari_store.being_recorded(dataset.id) and dataset.id not in minari_store.local_ids():
-                raise
+        except LockedError:  # another process records it, or trains its behaviour agent
             time.sleep(WAIT)
+        except OffbenchError:
+            if dataset.id not in minari_store.local_ids():  # else another process has just finished it
+                raise
 
 
 def check_recorded(dataset: GridDataset) -> None:

@@ -16,7 +16,9 @@ from offbench.common.errors import OffbenchError
 from offbench.common.progress import duration
 from offbench.common.text import counted
 from offbench.data import minari_store
+from offbench.data.card import expected_episode_length
 from offbench.data.levels import full_size, parse_level
+from offbench.data.minari_writer import BYTES_PER_EPISODE
 from offbench.data.recorded_env import evaluation_spec
 from offbench.envs.environments import make_env, parse_spec, spaces_of, time_limit, untrusted_env
 from offbench.envs.recipes import load_recipe
@@ -176,7 +178,8 @@ def write_plan(
     if missing := bench.missing():
         steps = sum(_size(dataset) for dataset in missing)
         say(f"  to record first: {', '.join(dataset.id for dataset in missing)} ({steps:,} transitions)")
-        costs.append(Cost(steps * step_time / bench.machine.workers, steps * _bytes_per_step(env_spec)))
+        disk = sum(_size(dataset) * _bytes_per_step(env_spec, _episode_length(dataset)) for dataset in missing)
+        costs.append(Cost(steps * step_time / bench.machine.workers, disk))
     for line in _totals(costs, bench.machine):
         say(line)
     return update_seconds
@@ -238,10 +241,16 @@ def _size(dataset: GridDataset) -> int:
     return full_size(parts, load_recipe(dataset.env).dataset_steps)
 
 
-def _bytes_per_step(env_spec: str) -> int:
+def _episode_length(dataset: GridDataset) -> float:
+    """Return about how long the episodes of a dataset to be recorded will be."""
+    recipe = load_recipe(dataset.env)
+    return expected_episode_length(recipe, dataset.level) or time_limit(parse_spec(recipe.env_spec())) or 1000
+
+
+def _bytes_per_step(env_spec: str, episode_length: float) -> float:
     """Return the bytes of a transition on disk: in the dataset (float64 observations) and in the cache (float32)."""
     observations, actions = spaces_of(make_env(env_spec), "the environment")
-    return 12 * observations.shape[0] + 8 * actions.shape[0] + 34
+    return 12 * observations.shape[0] + 8 * actions.shape[0] + 34 + BYTES_PER_EPISODE / episode_length
 
 
 def _names(variants: Sequence[Sequence[RunSpec]]) -> list[str]:

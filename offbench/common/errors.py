@@ -18,6 +18,10 @@ class OffbenchError(Exception):
     """A problem that the user can fix. The CLI prints its text as one line and exits with code 2."""
 
 
+class LockedError(OffbenchError):
+    """Another process holds a lock, so that it does this work already."""
+
+
 class DamagedError(OffbenchError):
     """The content of a file is invalid, as opposed to an error of the disk, a lock or a permission."""
 

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from offbench.common.errors import DamagedError, OffbenchError
+from offbench.common.errors import DamagedError, LockedError, OffbenchError
 
 JsonObject: TypeAlias = dict[str, Any]  # a JSON object whose values nothing has checked yet
 
@@ -91,7 +91,7 @@ def exclusive_lock(path: Path, what: str, timeout: float = LOCK_TIMEOUT) -> Iter
         timeout: seconds to wait for another process to release the lock.
 
     Raises:
-        OffbenchError: another process holds it; its process id and host are named.
+        LockedError: another process holds it; its process id and host are named.
     """
     from filelock import FileLock, Timeout  # imported here to keep --help fast
 
@@ -101,7 +101,7 @@ def exclusive_lock(path: Path, what: str, timeout: float = LOCK_TIMEOUT) -> Iter
         try:
             lock.acquire(timeout=timeout)
         except Timeout:
-            raise OffbenchError(f"{what} by {_holder(holder)}; wait for it, or stop it") from None
+            raise LockedError(f"{what} by {_holder(holder)}; wait for it, or stop it") from None
     try:
         _inodes[path] = path.stat().st_ino  # no new file gets this number while the lock is open
         with write_errors(str(path.parent)):

@@ -93,6 +93,13 @@ def compare_with_card(recipe: Recipe, level: str, content_sha256: str) -> str | 
     return f"warning: content differs from the dataset card's, {reason}"
 
 
+def expected_episode_length(recipe: Recipe, level: str) -> float | None:
+    """Return the mean length of a level's episodes by the shipped card, None if there is no card with the level."""
+    card = _shipped_card(recipe)
+    facts = card["levels"].get(level) if card else None
+    return facts["transitions"] / facts["episodes"] if facts else None
+
+
 def _shipped_card(recipe: Recipe) -> JsonObject | None:
     path = recipe.folder / "card.json" if recipe.folder else None
     return read_json(path) if path is not None and path.exists() else None

@@ -11,8 +11,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from offbench.common.errors import DamagedError, OffbenchError, nearest, unknown
 from offbench.common.files import (
     LOCK_TIMEOUT,
@@ -226,19 +224,6 @@ def check_content(dataset_id: str, metadata: JsonObject, content: str) -> None:
             f"{dataset_id} is damaged: its arrays are not those of the content_sha256 in its metadata; "
             "record or download it again"
         )
-
-
-def being_recorded(dataset_id: str) -> bool:
-    """Return whether another process is writing a dataset."""
-    path = path_of(dataset_id)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(hidden_path(path, "lock"))
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        return True
-    lock.release()
-    return False
 
 
 def hidden_path(path: Path, ending: str) -> Path:

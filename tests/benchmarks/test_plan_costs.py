@@ -10,6 +10,7 @@ import pytest
 
 import offbench
 from offbench.benchmarks import plan
+from offbench.benchmarks.grid import GridDataset
 from offbench.benchmarks.plan import Cost, prepare, write_plan
 from offbench.benchmarks.throughput import Rate
 from offbench.envs.recipes import load_recipe
@@ -36,7 +37,7 @@ def test_a_plan_adds_up_time_and_disk_space(home: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(plan, "measure", lambda *_: RATE)
     monkeypatch.setattr(plan, "operations", lambda *_: 1e9)
     monkeypatch.setattr(plan, "step_seconds", lambda _: 1e-3)
-    monkeypatch.setattr(plan, "_bytes_per_step", lambda _: 50)
+    monkeypatch.setattr(plan, "_bytes_per_step", lambda *_: 50)
     costs: list[Cost] = []
     totals = plan._totals
 
@@ -57,10 +58,13 @@ def test_a_plan_adds_up_time_and_disk_space(home: Path, monkeypatch: pytest.Monk
     assert lines[-2] == "  on 2 processes of one thread about 1 h 23 min, 8.5 GB of disk (measured just now)"
 
 
-@pytest.mark.parametrize(("env", "level"), [("inverted-pendulum", "expert"), ("halfcheetah", "random")])
+@pytest.mark.parametrize(
+    ("env", "level"), [("inverted-pendulum", "expert"), ("halfcheetah", "random"), ("hopper", "random")]
+)
 def test_a_transition_takes_as_much_disk_space_as_the_plan_says(env: str, level: str, home: Path) -> None:
-    """In the dataset and in the cache, for episodes of 1,000 steps."""
+    """In the dataset and in the cache, for episodes of 1,000 steps and of 22."""
     offbench.load(offbench.collect(env, level, steps=2000, workers=1))
     files = [path for folder in ("minari", "cache") for path in (home / folder).rglob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files) / 2000
-    assert plan._bytes_per_step(load_recipe(env).env_spec()) == pytest.approx(size, rel=0.2)
+    length = plan._episode_length(GridDataset("x-v0", env, level))
+    assert plan._bytes_per_step(load_recipe(env).env_spec(), length) == pytest.approx(size, rel=0.2)

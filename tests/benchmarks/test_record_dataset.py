@@ -20,7 +20,7 @@ from offbench.benchmarks.benchmark import LocalExecutor, _seconds, benchmark
 from offbench.benchmarks.datasets import record_dataset
 from offbench.benchmarks.grid import GridDataset
 from offbench.benchmarks.plan import prepare
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import LockedError, OffbenchError
 from offbench.common.files import exclusive_lock
 from offbench.data import minari_store
 from tests.benchmarks.test_benchmark import GRID, silent
@@ -54,6 +54,21 @@ def recording_meanwhile(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_a_dataset_that_another_process_gives_up_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     with recording_meanwhile(monkeypatch):
         assert MINE.id not in minari_store.local_ids()
+    assert minari_store.read_metadata(MINE.id)["total_steps"] == 100
+
+
+def test_a_lock_that_is_released_at_once_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other process stops between the refusal and the next look at the lock, or trained the behaviour agent."""
+    collect, refusals = datasets.collect, [LockedError("mine-v0 is being recorded by process 1 on here")]
+
+    def refused_once(*words: Any, **options: Any) -> str:
+        if refusals:
+            raise refusals.pop()
+        return collect(*words, **options)
+
+    monkeypatch.setattr(datasets, "collect", refused_once)
+    monkeypatch.setattr(datasets, "WAIT", 0.01)
+    record_dataset(MINE, 1)
     assert minari_store.read_metadata(MINE.id)["total_steps"] == 100
 
 
