@@ -57,10 +57,9 @@ class Trace:
         self.key: list[tuple[object, Nested]] = []
         self.outside: list[Tensor] = []
         self._kept: list[Nested] = []  # no storage of the record is freed and used again
-        self._origins: dict[
-            int, tuple[str, int]
-        ] = {}  # by a storage's address: the call that allocated it, or `outside`
-        self._constants: dict[int, int] = {}  # by a storage's address: the call that fills it
+        # by a storage's address: the call that allocated it or `outside`, and the call that fills it with constants
+        self._origins: dict[int, tuple[str, int]] = {}
+        self._constants: dict[int, int] = {}
 
     def replay(self) -> None:
         """Do the update once more. Call it within `torch.inference_mode()`."""
@@ -84,9 +83,7 @@ class Trace:
         Args:
             constant: it writes the same numbers every time.
         """
-        described = tree_map_only(
-            float, repr, tree_map_only(Tensor, self._describe, reads)
-        )  # repr, so that NaN compares equal
+        described = tree_map_only(float, repr, tree_map_only(Tensor, self._describe, reads))  # as text, NaN equals NaN
         origin = ("call", len(self.calls))
         for tensor in _tensors(writes):
             self._origins.setdefault(_address(tensor), origin)

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from offbench.benchmarks.grid import GridDataset
 from offbench.common.errors import LockedError, OffbenchError
 from offbench.common.files import JsonObject
+from offbench.common.terminal import inform
 from offbench.data import minari_store
 from offbench.data.collect import collect
 from offbench.data.levels import full_size, parse_level
@@ -22,6 +23,7 @@ WAIT = 5.0  # seconds between two checks of a dataset that another process recor
 
 def record_dataset(dataset: GridDataset, workers: int) -> None:
     """Record a grid's dataset, or wait for the process that records it. Raises OffbenchError if it cannot be."""
+    waiting = False
     while dataset.id not in minari_store.local_ids():
         try:
             collect(
@@ -32,7 +34,10 @@ def record_dataset(dataset: GridDataset, workers: int) -> None:
                 workers=workers,
                 dataset_id=dataset.id,
             )
-        except LockedError:  # another process records it, or trains its behaviour agent
+        except LockedError as error:  # another process records it, or trains its behaviour agent
+            if not waiting:
+                inform(f"{str(error).rpartition('; ')[0]}; waiting for it")
+            waiting = True
             time.sleep(WAIT)
         except OffbenchError:
             if dataset.id not in minari_store.local_ids():  # else another process has just finished it

@@ -132,9 +132,8 @@ def _is_same(dataset_id: str, wanted: JsonObject) -> bool:
         DamagedError: its data cannot be opened.
     """
     recorded = minari_store.read_provenance(minari_store.read_metadata(dataset_id))
-    new = minari_store.read_provenance(
-        json.loads(json.dumps({minari_store.KEY: wanted[minari_store.KEY]}))
-    )  # as written
+    as_written = json.loads(json.dumps({minari_store.KEY: wanted[minari_store.KEY]}))
+    new = minari_store.read_provenance(as_written)
     same = all(recorded.versions.get(name) == new.versions.get(name) for name in PHYSICS)
     same = same and all(getattr(recorded, key) == getattr(new, key) for key in IDENTITY)
     if same and (changed := describe_changes(recorded.env_code, new.env_code)):

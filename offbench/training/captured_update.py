@@ -18,7 +18,7 @@ Sums = list[tuple[str, float, int]]  # (name, sum, number of updates) of each lo
 # updates of a phase before a replay is trusted on a CPU: all but the first are recorded and compared
 TRACED_UPDATES = 6
 WATCHED_UPDATES = range(2, 9)  # updates after which attributes are compared; the first update only tests the code
-TRACE_EVERY = 1000  # updates of a phase between two later records of it
+TRACE_EVERY = 1000  # updates of a phase between two later traces of it
 WARM_UP = 3  # updates of a phase before it is captured on a GPU: libraries allocate workspaces in the first ones
 
 
@@ -35,12 +35,9 @@ class CapturedUpdate:
         self.position = torch.zeros(1, dtype=torch.int64, device=self.device)
         self.indices, self.noise = torch.empty(0), dict[str, Tensor]()
         self.sums: dict[str, Tensor] = {}
-        self.counts: Counter[str] = (
-            Counter()
-        )  # number of updates in each of `sums`, without those of an earlier session
-        self.earlier: list[Counter[str]] = [
-            Counter() for _ in store.sizes
-        ]  # numbers of updates of an earlier session, which differ between runs
+        # number of updates in each of `sums`: of this session, and of an earlier one, where runs can differ
+        self.counts: Counter[str] = Counter()
+        self.earlier: list[Counter[str]] = [Counter() for _ in store.sizes]
         self._names: dict[Hashable, list[str]] = {}  # what each phase logs
         self._graphs: dict[Hashable, torch.cuda.CUDAGraph] = {}
         self._traces: dict[Hashable, Trace] = {}

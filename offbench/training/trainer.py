@@ -57,9 +57,8 @@ class Trainer:
         self.loggers = Loggers(self.runs, job.loggers)
         self.evaluations: list[dict[int, list[tuple[float, int]]]] = [{} for _ in self.runs]
         self.losses: list[list[dict[str, float]]] = [[] for _ in self.runs]
-        self.pending: list[
-            tuple[int, int, list[Future[list[EpisodeStats]]]]
-        ] = []  # (run, step, episodes) being played
+        # (run, step, episodes) of evaluations that are being played
+        self.pending: list[tuple[int, int, list[Future[list[EpisodeStats]]]]] = []
         self.rollouts: Rollouts | None = None
         self.note = ""
         self.diverged: dict[int, str] = {}  # runs that have diverged, and the message for the user

@@ -57,9 +57,12 @@ def test_a_dataset_that_another_process_gives_up_is_recorded(monkeypatch: pytest
     assert minari_store.read_metadata(MINE.id)["total_steps"] == 100
 
 
-def test_a_lock_that_is_released_at_once_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_that_is_released_meanwhile_is_no_error(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """The other process stops between the refusal and the next look at the lock, or trained the behaviour agent."""
-    collect, refusals = datasets.collect, [LockedError("mine-v0 is being recorded by process 1 on here")]
+    locked = LockedError("mine-v0 is being recorded by process 1 on here; wait for it, or stop it")
+    collect, refusals = datasets.collect, [locked, locked]
 
     def refused_once(*words: Any, **options: Any) -> str:
         if refusals:
@@ -70,6 +73,7 @@ def test_a_lock_that_is_released_at_once_is_no_error(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(datasets, "WAIT", 0.01)
     record_dataset(MINE, 1)
     assert minari_store.read_metadata(MINE.id)["total_steps"] == 100
+    assert capfd.readouterr().err.count("mine-v0 is being recorded by process 1 on here; waiting for it\n") == 1
 
 
 def test_a_dataset_that_another_process_finishes_is_taken(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
