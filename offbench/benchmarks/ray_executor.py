@@ -87,11 +87,13 @@ class RayExecutor:
         """The cluster's processors."""
         return int(self.ray.cluster_resources().get("CPU", 1))
 
-    def record(self, sources: Sequence[GridDataset], workers: int) -> None:
+    def record(self, datasets: Sequence[GridDataset], workers: int) -> None:
         """Record datasets, a task each. Raises OffbenchError for the first that failed."""
         task = self.ray.remote(**self._options)(_record)
         with _token(minari_store.root()) as token:
-            results = self.ray.get([task.remote(s, str(minari_store.root()), token, self.server) for s in sources])
+            results = self.ray.get(
+                [task.remote(dataset, str(minari_store.root()), token, self.server) for dataset in datasets]
+            )
         raise_first([line for _, lines in results for line in lines])
 
     def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
