@@ -8,12 +8,16 @@ A node that can read the driver's token on its own disk works in the driver's fo
 datasets and checkpoints from the file server, trains in a folder of its own and uploads the run folders. If a node
 is lost, Ray runs its tasks again from what it has uploaded; a run's bits do not depend on where it resumes.
 
+Ray would put the driver's current folder on the nodes' import path, where a file named like a standard module replaces
+that module. With an empty folder as Ray's `working_dir` it does not.
+
 An algorithm of the user's own is sent with each task as the code that the driver imported, so that all nodes run that
 code, whatever files they have. Packages must be installed on each node.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import socket
@@ -21,7 +25,6 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -71,7 +74,14 @@ class RayExecutor:
         if not ray.is_initialized():
             try:
                 _check_address(address)
-                ray.init(address=address, log_to_driver=False, include_dashboard=False)
+                with tempfile.TemporaryDirectory() as empty:  # uploaded now
+                    ray.init(
+                        address=address,
+                        runtime_env={"working_dir": empty},
+                        log_to_driver=False,
+                        logging_level="WARNING",
+                        include_dashboard=False,
+                    )
             except (OSError, RuntimeError, ValueError, SystemExit) as error:
                 raise OffbenchError(
                     f"no Ray cluster at {address}: {error}; start one with `ray start --head`"
@@ -90,10 +100,9 @@ class RayExecutor:
     def record(self, datasets: Sequence[GridDataset], workers: int) -> None:
         """Record datasets, a task each. Raises OffbenchError for the first that failed."""
         task = self.ray.remote(**self._options)(_record)
-        with _token(minari_store.root()) as token:
-            results = self.ray.get(
-                [task.remote(dataset, str(minari_store.root()), token, self.server) for dataset in datasets]
-            )
+        root, here = minari_store.root().resolve(), str(Path.cwd())
+        with _token(root) as token:
+            results = self.ray.get([task.remote(dataset, str(root), here, token, self.server) for dataset in datasets])
         raise_first([line for _, lines in results for line in lines])
 
     def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
@@ -206,7 +215,7 @@ def write_folder(folder: Path, files: Files) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-@contextmanager
+@contextlib.contextmanager
 def _token(folder: Path) -> Iterator[str]:
     """Write a file that a node can read if it shares the driver's disk."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -227,7 +236,7 @@ def _shared(token: str) -> bool:
         return False
 
 
-@contextmanager
+@contextlib.contextmanager
 def _own_folder() -> Iterator[Path]:
     """Yield a temporary folder for this task, which also holds Minari's datasets and the cache."""
     with (
@@ -282,17 +291,20 @@ def _train_groups(job: Job, report: Callable[[int, str], None]) -> list[str]:
     return [line for group in groups for line in train_job(replace(job, specs=tuple(group)), report)]
 
 
-def _record(source: GridDataset, datasets: str, token: str, server: ActorHandle) -> tuple[bool, list[str]]:
-    """A task: record a dataset."""
-    return _task(lambda: _record_here(source, datasets, token, server), source.id)
+def _record(
+    source: GridDataset, datasets: str, driver_folder: str, token: str, server: ActorHandle
+) -> tuple[bool, list[str]]:
+    """A task: record a dataset. Relative paths of recipes and behaviour agents start at `driver_folder`."""
+    return _task(lambda: _record_here(source, datasets, driver_folder, token, server), source.id)
 
 
-def _record_here(source: GridDataset, datasets: str, token: str, server: ActorHandle) -> list[str]:
+def _record_here(source: GridDataset, datasets: str, driver_folder: str, token: str, server: ActorHandle) -> list[str]:
     import ray
 
-    if _shared(token):
+    if _shared(token) and Path(driver_folder).is_dir():
         os.environ["MINARI_DATASETS_PATH"] = datasets
-        record_dataset(source, workers=1)
+        with contextlib.chdir(driver_folder):
+            record_dataset(source, workers=1)
         return []
     with _own_folder():
         record_dataset(source, workers=1)

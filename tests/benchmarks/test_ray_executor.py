@@ -18,7 +18,7 @@ import pytest
 from offbench.algorithm import Logs
 from offbench.benchmarks import ray_executor
 from offbench.benchmarks.benchmark import benchmark
-from offbench.benchmarks.grid import load_grid
+from offbench.benchmarks.grid import GridDataset, load_grid
 from offbench.benchmarks.plan import prepare
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
@@ -28,6 +28,7 @@ from offbench.training.registry import load_algorithm
 from offbench.training.run import Run, find_runs
 from offbench.training.spec import Job, RunSpec
 from offbench.training.train import Training
+from tests.conftest import TINY_RECIPE
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
 
@@ -54,7 +55,6 @@ def two_nodes(home: Path) -> Iterator[Any]:
     nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
     try:
         workers = [nodes.add_node(num_cpus=1) for _ in range(2)]
-        ray.init(address=nodes.address, log_to_driver=False)
         yield nodes, workers
     finally:
         ray.shutdown()
@@ -222,6 +222,31 @@ def test_the_command_line_trains_on_a_cluster(
     assert asked == [2]
     same(home, "local", "ray")
     assert "next: offbench report --runs ray" in capsys.readouterr().err
+
+
+def test_tasks_read_files_of_the_drivers_folder_but_import_none(
+    two_nodes: Any, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The cluster was started in another folder; recipe, behaviour agents and datasets are named by relative paths."""
+    nodes, _ = two_nodes
+    project = home / "project"
+    project.mkdir()
+    monkeypatch.chdir(project)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", "datasets")
+    (project / "colorsys.py").write_text("raise RuntimeError")
+    (project / "tiny.toml").write_text(TINY_RECIPE)
+    executor = ray_executor.RayExecutor(nodes.address)
+
+    def imported_file() -> str:
+        import colorsys
+
+        return colorsys.__file__
+
+    imported = executor.ray.get(executor.ray.remote(imported_file).remote())
+    assert Path(imported).parent == Path(os.__file__).parent
+    executor.record([GridDataset("tiny-medium-v0", "./tiny.toml", "medium", steps=500)], 1)
+    assert (project / "datasets" / "tiny-medium-v0" / "data").is_dir()
+    assert list((project / "behaviour" / "tiny").iterdir())
 
 
 def test_what_fails_on_a_node_is_said_here(two_nodes: Any, home: Path) -> None:
