@@ -43,7 +43,7 @@ from tests.data.test_import_and_export import d4rl_file
 from tests.faults.spoil import WOUNDS, spoiled_json, spoiled_tensors, spoiled_words, wounded
 
 NEW = int(os.environ.get("OFFBENCH_FUZZ", "0"))
-CASES = NEW or 12_500  # of each of the readers below, in the slow run
+CASES = NEW or 10_000  # of each of the readers below, in the slow run
 PARTS = max(1, NEW // 10_000)  # a test each, for `make nightly`
 FEW = 40  # in the fast one
 QUICK = datetime.timedelta(seconds=20)  # a case that takes longer hangs
