@@ -47,7 +47,7 @@ rungs = 4
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the slow tests, the longest of which are in the last files, so that no core waits for one at the end."""
+    """Start with the slow tests, the longest (in the last files) first, so that no core waits for one at the end."""
     slow = [item for item in items if item.get_closest_marker("slow")]
     items[:] = [*reversed(slow), *(item for item in items if not item.get_closest_marker("slow"))]
 
