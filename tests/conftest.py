@@ -47,9 +47,8 @@ rungs = 4
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the slow tests, the longest (in the last files) first, so that no core waits for one at the end."""
-    slow = [item for item in items if item.get_closest_marker("slow")]
-    items[:] = [*reversed(slow), *(item for item in items if not item.get_closest_marker("slow"))]
+    """Start with the slow tests, so that no core waits for a long one at the end."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
 @pytest.fixture
