@@ -18,17 +18,37 @@ SETTLED = 50_000  # updates after which the ranges of logged quantities are give
 LOGGED = ("beta", "uncertainty")
 
 
-def scores(entries: list[Entry]) -> list[str]:
+Curve = dict[float, float]  # {step: score}
+
+
+def scores(entries: list[Entry], curves: list[Curve]) -> list[str]:
     """Return a table of the scores: a row for each evaluation, a column for each method."""
-    curves = [dict(zip(*(part.T.tolist() for part in _curve(entry)), strict=True)) for entry in entries]
     steps = sorted(set().union(*curves))
     rows = [[f"{step:,.0f}", *(f"{c[step]:.1f}" if step in c else "-" for c in curves)] for step in steps]
     return aligned(["step", *(entry.method.label for entry in entries)], rows, names=0)
 
 
-def _curve(entry: Entry) -> tuple[np.ndarray, np.ndarray]:
+def _curve(entry: Entry) -> Curve:
     steps, values = entry.drawn_curve()
-    return np.array(steps), values.mean(0)
+    return dict(zip(steps, values.mean(0).tolist(), strict=True))
+
+
+def second_half(entries: list[Entry], curves: list[Curve]) -> list[str]:
+    """Return a line on each method's scores in the second half of its updates, compared with the first method's."""
+    lines, first = [], curves[0]
+    for entry, curve in zip(entries, curves, strict=True):
+        late = [step for step in curve if step >= max(curve) / 2]
+        values = [curve[step] for step in late]
+        line = f"{entry.method.label}: {min(values):.1f} to {max(values):.1f} from {late[0]:,.0f} updates on, "
+        line += f"mean {np.mean(values):.1f}"
+        if curve is not first and set(curve) <= set(first):
+            above = [step for step in late if curve[step] > first[step]]
+            line += f"; above {entries[0].method.label} at {len(above)} of {len(late)} evaluations"
+            last = max((step for step in curve if curve[step] <= first[step]), default=0)
+            if always := [step for step in curve if step > last]:
+                line += f", at all from {always[0]:,.0f} updates on"
+        lines.append(line)
+    return lines
 
 
 def evaluations(entry: Entry) -> str:
@@ -62,7 +82,9 @@ def main() -> None:
     results = read_results(parser.parse_args().runs)
     for task in results.tasks:
         entries = results.on(task)
-        lines = [*scores(entries), "", *map(evaluations, entries), *(line for e in entries for line in logged(e))]
+        curves = [_curve(entry) for entry in entries]
+        lines = [*scores(entries, curves), "", *second_half(entries, curves), *map(evaluations, entries)]
+        lines += [line for entry in entries for line in logged(entry)]
         print("\n".join([task.name, *lines, ""]))
 
 

@@ -4,9 +4,10 @@
     task            trains one job for at most a slice of time and returns; the driver submits what is left of it again
     FileServer      an actor on the driver's node: reads and writes files there for nodes that do not share its disk
 
-A node that can read the driver's token on its own disk works in the driver's folders. Any other node downloads the
-datasets and checkpoints from the file server, trains in a folder of its own and uploads the run folders. If a node
-is lost, Ray runs its tasks again from what it has uploaded; a run's bits do not depend on where it resumes.
+A node that can read the driver's token on its own disk works in the driver's folders, as the driver itself would. Any
+other node downloads the datasets and checkpoints from the file server, trains in a folder of its own and uploads the
+run folders. If a node is lost, Ray runs its tasks again from what it has uploaded; a run's bits do not depend on where
+it resumes.
 
 Ray would put the driver's current folder on the nodes' import path, where a file named like a standard module replaces
 that module. With an empty folder as Ray's `working_dir` it does not.
@@ -25,7 +26,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,7 +75,7 @@ class RayExecutor:
         if not ray.is_initialized():
             try:
                 _check_address(address)
-                with tempfile.TemporaryDirectory() as empty:  # uploaded now
+                with tempfile.TemporaryDirectory() as empty:  # ray.init uploads it
                     ray.init(
                         address=address,
                         runtime_env={"working_dir": empty},
@@ -100,9 +101,8 @@ class RayExecutor:
     def record(self, datasets: Sequence[GridDataset], workers: int) -> None:
         """Record datasets, a task each. Raises OffbenchError for the first that failed."""
         task = self.ray.remote(**self._options)(_record)
-        root, here = minari_store.root().resolve(), str(Path.cwd())
-        with _token(root) as token:
-            results = self.ray.get([task.remote(dataset, str(root), here, token, self.server) for dataset in datasets])
+        with _driver(minari_store.root()) as driver:
+            results = self.ray.get([task.remote(dataset, driver, self.server) for dataset in datasets])
         raise_first([line for _, lines in results for line in lines])
 
     def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
@@ -112,11 +112,11 @@ class RayExecutor:
         for name in {job.first.algorithm for job in jobs}:
             self._send_code(name)
         waiting, active, problems = list(range(len(jobs))), dict["ObjectRef", int](), list[str]()
-        with JobProgress(jobs) as progress, _token(common) as token:
+        with JobProgress(jobs) as progress, _driver(common) as driver:
             while waiting or active:
                 for index in waiting:
                     if not jobs[index].deadline_passed:
-                        active[self._start(jobs[index], index, token)] = index
+                        active[self._start(jobs[index], index, driver)] = index
                 waiting = []
                 for ref in self.ray.wait(list(active), num_returns=1, timeout=POLL)[0] if active else ():
                     index = active.pop(ref)
@@ -141,12 +141,12 @@ class RayExecutor:
                 f"the code of {algorithm} cannot be sent to the nodes ({error}); install it as a package on each"
             ) from error
 
-    def _start(self, job: Job, index: int, token: str) -> ObjectRef:
+    def _start(self, job: Job, index: int, driver: Driver) -> ObjectRef:
         gpu = {"num_gpus": 1} if job.device != "cpu" else {}
         task = self.ray.remote(**self._options, **gpu)(_train)
         rest = replace(job, specs=unfinished(job))
         own = user_algorithm(job.first.algorithm)
-        return task.remote(rest, own, self.slice, index, str(minari_store.root().resolve()), token, self.server)
+        return task.remote(rest, own, self.slice, index, driver, self.server)
 
     def _result(self, ref: ObjectRef, job: Job) -> tuple[bool, list[str]]:
         try:
@@ -215,25 +215,47 @@ def write_folder(folder: Path, files: Files) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
+@dataclass(frozen=True)
+class Driver:
+    """The driver's folders.
+
+    Attributes:
+        folder: the current folder, at which relative paths start.
+        datasets: Minari's folder.
+        token: a file in a folder that tasks write to, by which a node finds out whether it shares the disk.
+        content: what the token holds.
+    """
+
+    folder: Path
+    datasets: Path
+    token: Path
+    content: str
+
+    def shares_disk(self) -> bool:
+        """Return whether this node can work in the driver's folders."""
+        try:
+            return self.folder.is_dir() and self.token.read_text() == self.content
+        except OSError:
+            return False
+
+    @contextlib.contextmanager
+    def folders(self) -> Iterator[None]:
+        """Work in the driver's folders within this context."""
+        with contextlib.chdir(self.folder), environment({"MINARI_DATASETS_PATH": str(self.datasets)}):
+            yield
+
+
 @contextlib.contextmanager
-def _token(folder: Path) -> Iterator[str]:
-    """Write a file that a node can read if it shares the driver's disk."""
+def _driver(folder: Path) -> Iterator[Driver]:
+    """Yield the driver of this process, with a token in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f".offbench-token-{os.getpid()}"
-    content = os.urandom(16).hex()
-    write_bytes(path, content.encode())
+    token = folder.resolve() / f".offbench-token-{os.getpid()}"
+    driver = Driver(Path.cwd(), minari_store.root().resolve(), token, os.urandom(16).hex())
+    write_bytes(token, driver.content.encode())
     try:
-        yield f"{path.resolve()}\n{content}"
+        yield driver
     finally:
-        path.unlink(missing_ok=True)
-
-
-def _shared(token: str) -> bool:
-    path, content = token.split("\n")
-    try:
-        return Path(path).read_text() == content
-    except OSError:
-        return False
+        token.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -247,7 +269,7 @@ def _own_folder() -> Iterator[Path]:
 
 
 def _train(
-    job: Job, own: type | None, seconds: float, index: int, datasets: str, token: str, server: ActorHandle
+    job: Job, own: type | None, seconds: float, index: int, driver: Driver, server: ActorHandle
 ) -> tuple[bool, list[str]]:
     """A task: train a job for a slice of time, which begins now, however long the task has waited.
 
@@ -262,20 +284,18 @@ def _train(
     def report(step: int, note: str) -> None:
         server.report.remote(index, step, note)
 
-    return _task(lambda: _train_here(job, datasets, token, server, report), job.title)
+    return _task(lambda: _train_here(job, driver, server, report), job.title)
 
 
-def _train_here(
-    job: Job, datasets: str, token: str, server: ActorHandle, report: Callable[[int, str], None]
-) -> list[str]:
+def _train_here(job: Job, driver: Driver, server: ActorHandle, report: Callable[[int, str], None]) -> list[str]:
     import ray
 
-    if _shared(token):
-        os.environ["MINARI_DATASETS_PATH"] = datasets
-        return _train_groups(job, report)
+    if driver.shares_disk():
+        with driver.folders():
+            return _train_groups(job, report)
     with _own_folder() as folder:
         for name in {spec.dataset for spec in job.specs}:
-            write_folder(minari_store.path_of(name), ray.get(server.read.remote(f"{datasets}/{name}")))
+            write_folder(minari_store.path_of(name), ray.get(server.read.remote(str(driver.datasets / name))))
         own = tuple(replace(spec, folder=folder / str(i)) for i, spec in enumerate(job.specs))
         for spec, local in zip(job.specs, own, strict=True):
             write_folder(local.folder, ray.get(server.read.remote(str(spec.folder))))
@@ -291,24 +311,22 @@ def _train_groups(job: Job, report: Callable[[int, str], None]) -> list[str]:
     return [line for group in groups for line in train_job(replace(job, specs=tuple(group)), report)]
 
 
-def _record(
-    source: GridDataset, datasets: str, driver_folder: str, token: str, server: ActorHandle
-) -> tuple[bool, list[str]]:
-    """A task: record a dataset. Relative paths of recipes and behaviour agents start at `driver_folder`."""
-    return _task(lambda: _record_here(source, datasets, driver_folder, token, server), source.id)
+def _record(source: GridDataset, driver: Driver, server: ActorHandle) -> tuple[bool, list[str]]:
+    """A task: record a dataset."""
+    return _task(lambda: _record_here(source, driver, server), source.id)
 
 
-def _record_here(source: GridDataset, datasets: str, driver_folder: str, token: str, server: ActorHandle) -> list[str]:
+def _record_here(source: GridDataset, driver: Driver, server: ActorHandle) -> list[str]:
     import ray
 
-    if _shared(token) and Path(driver_folder).is_dir():
-        os.environ["MINARI_DATASETS_PATH"] = datasets
-        with contextlib.chdir(driver_folder):
+    if driver.shares_disk():
+        with driver.folders():
             record_dataset(source, workers=1)
         return []
     with _own_folder():
         record_dataset(source, workers=1)
-        ray.get(server.replace.remote(f"{datasets}/{source.id}", read_folder(minari_store.path_of(source.id))))
+        files = read_folder(minari_store.path_of(source.id))
+        ray.get(server.replace.remote(str(driver.datasets / source.id), files))
     return []
 
 

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -105,10 +106,10 @@ def test_a_slice_begins_when_its_task_does(home: Path, medium: str, monkeypatch:
     config: Any = load_algorithm("td3_bc").Config(hidden=(16, 16))
     spec = RunSpec("td3_bc", config, medium, 0, 1_000, 1_000, 1, home / "runs" / medium / "td3_bc/default/seed-0")
     (job,) = Training([spec], Machine("cpu", 1)).jobs
-    with ray_executor._token(home) as token:
+    with ray_executor._driver(home) as driver:
         with monkeypatch.context() as patched:
             patched.setattr(ray_executor, "time", SimpleNamespace(time=lambda: time.time() - 60))
-            task, words = executor._start(job, 0, token)
+            task, words = executor._start(job, 0, driver)
         assert task(*words) == (True, [])
     assert not ray_executor.unfinished(job)
 
@@ -126,8 +127,8 @@ def test_runs_that_a_lost_node_left_far_apart_resume_on_their_own(home: Path, me
         train_job(started, lambda *_: None)
     job = Job(specs("apart", 600), "cpu")
     begun: list[int] = []
-    with ray_executor._token(home) as token:
-        arguments = (str(home / "minari"), token, SimpleNamespace(), lambda step, _: begun.append(step))
+    with ray_executor._driver(home) as driver:
+        arguments = (driver, SimpleNamespace(), lambda step, _: begun.append(step))
         assert ray_executor._train_here(job, *arguments) == []
     assert begun[0] == 400
     assert 100 in begun
@@ -145,11 +146,14 @@ def test_nodes_that_share_no_disk_fetch_and_bring_back(
     assert run("local", None)
     shutil.rmtree(home / "minari")  # to be recorded on a node as well
 
-    @contextmanager
-    def foreign(folder: Path) -> Iterator[str]:
-        yield f"{folder}/no-such-token\n"
+    driver_of = ray_executor._driver
 
-    monkeypatch.setattr(ray_executor, "_token", foreign)
+    @contextmanager
+    def foreign(folder: Path) -> Iterator[ray_executor.Driver]:
+        with driver_of(folder) as driver:
+            yield replace(driver, content="another")
+
+    monkeypatch.setattr(ray_executor, "_driver", foreign)
     assert run("ray", ray_executor.RayExecutor(nodes.address, slice_seconds=2))
     same(home, "local", "ray")
 
