@@ -17,7 +17,8 @@ from pathlib import Path
 from offbench.common.files import sha256
 
 LEFT_OUT = {tokenize.COMMENT, tokenize.NL, tokenize.ENCODING, tokenize.ENDMARKER}
-MAIN = "__main__: "  # begins the names of what a class of a script uses there
+PART_OF = ": "  # in names of what earlier versions did not record: what a class of a script or a MuJoCo model uses
+MAIN = f"__main__{PART_OF}"
 
 
 def describe_changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
@@ -27,9 +28,14 @@ def describe_changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     if not set(before) & set(now):
         return f"{', '.join(before)}, not {', '.join(now)}"
     differ = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-    if not any(name.startswith(MAIN) for name in before):  # earlier versions did not record them
-        differ = [name for name in differ if not name.startswith(MAIN)]
+    recorded = {_whole(name) for name in before}
+    differ = [name for name in differ if _whole(name) in recorded or not _whole(name)]
     return ", ".join(f"{name} {_describe_change(before.get(name), now.get(name))}" for name in differ)
+
+
+def _whole(name: str) -> str:
+    """Return what `name` names a part of, "" if it names no part."""
+    return name.rpartition(PART_OF)[0]
 
 
 def _describe_change(before: str | None, now: str | None) -> str:

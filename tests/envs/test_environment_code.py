@@ -9,13 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import pytest
 
 import offbench
 from offbench.analysis.results import read_results
+from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError
 from offbench.envs.environment_code import environment_code
 from offbench.envs.environments import env_spec
+from offbench.envs.model_files import loaded_files
 from offbench.training.run import Run
 from tests.conftest import TINY_RECIPE, forget_modules
 
@@ -78,6 +81,57 @@ def test_a_model_that_an_argument_names_is_hashed(home: Path) -> None:
     assert list(before) == ["heavy.xml"]
     model.write_text(model.read_text().replace('gravity="0 0 -9.81"', 'gravity="0 0 -5"'))
     assert environment_code(spec) != before
+
+
+ROBOT = """<mujoco>
+  <compiler meshdir="meshes"/>
+  <include file="parts/world.xml"/>
+  <asset><mesh name="foot" file="foot.obj"/></asset>
+</mujoco>"""
+FOOT = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+PARTS = {"parts/world.xml": '<mujoco><include file="gravity.xml"/></mujoco>', "meshes/foot.obj": FOOT}
+GRAVITY = '<mujoco><option gravity="0 0 -5"/></mujoco>'
+
+
+@pytest.fixture
+def robot(home: Path) -> Path:
+    """A MuJoCo model that includes a file which includes another, and loads a mesh."""
+    for name, text in {"robot.xml": ROBOT, **PARTS, "parts/gravity.xml": GRAVITY, "parts/unused.xml": GRAVITY}.items():
+        (home / name).parent.mkdir(exist_ok=True)
+        (home / name).write_text(text)
+    return home / "robot.xml"
+
+
+def test_the_files_of_a_model_are_those_that_mujoco_loads(robot: Path) -> None:
+    found = {str(robot.parent / name) for name in loaded_files(robot)}
+    assert found == {str(robot.parent / name) for name in (*PARTS, "parts/gravity.xml")}
+    if hasattr(mujoco, "mju_getXMLDependencies"):  # not in the oldest MuJoCo
+        assert found | {str(robot)} == set(mujoco.mju_getXMLDependencies(str(robot)))
+
+
+def test_files_that_a_model_loads_are_hashed(robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(robot.parent))
+    spec = {"entry_point": "gymnasium.envs:X", "kwargs": {"xml_file": "~/robot.xml"}}
+    before = environment_code(json.dumps(spec))
+    assert list(before) == ["robot.xml", *(f"robot.xml: {name}" for name in sorted([*PARTS, "parts/gravity.xml"]))]
+    (robot.parent / "parts/gravity.xml").write_text(GRAVITY.replace("-5", "-9"))
+    after = environment_code(json.dumps(spec))
+    assert describe_changes(before, after) == "robot.xml: parts/gravity.xml has changed"
+    assert describe_changes({"robot.xml": before["robot.xml"]}, after) == ""  # recorded by an earlier version
+    assert describe_changes({"robot.xml": "0" * 64}, after) == "robot.xml has changed"
+
+
+def test_the_model_of_a_class_is_hashed(home: Path, recipe: Path) -> None:
+    assets = Path(gym.envs.mujoco.__file__).parent / "assets"
+    model = home / "heavy.xml"
+    model.write_bytes((assets / "inverted_pendulum.xml").read_bytes())
+    init = f"        super().__init__(xml_file={str(model)!r})\n"
+    edit(home, "pushed.py", ENVIRONMENT.replace("    def step", f"    def __init__(self):\n{init}\n    def step"))
+    spec = env_spec("pushed:Pushed-v0")
+    before = environment_code(spec)
+    assert list(before) == ["gains.py", "model: heavy.xml", "pushed.py"]
+    model.write_text(model.read_text().replace('gravity="0 0 -9.81"', 'gravity="0 0 -5"'))
+    assert describe_changes(before, environment_code(spec)) == "model: heavy.xml has changed"
 
 
 def test_files_of_one_name_and_in_lists_are_all_hashed(home: Path) -> None:
