@@ -173,7 +173,7 @@ def write_plan(
         update_seconds[spec.algorithm] = run_seconds / spec.steps
         cost = _variant_cost(specs, rate, run_seconds, env_spec, bench.machine)
         size = f"{counted(len(specs), 'run'):>9} x {spec.steps:>{steps_width},} updates"
-        say(f"  {name:<{name_width}}{size} at {rate.updates:>5,.0f}/s: {duration(cost.seconds)}")
+        say(f"  {name:<{name_width}}{size} at {rate.updates_per_second:>5,.0f}/s: {duration(cost.seconds)}")
         costs.append(cost)
     if missing := bench.missing():
         steps = sum(_size(dataset) for dataset in missing)
@@ -187,11 +187,12 @@ def write_plan(
 
 def _environment(bench: Benchmark) -> tuple[str, float]:
     """Return the EnvSpec of an environment of the grid, for the shapes, and the seconds of a step in all of them."""
-    env_specs = {dataset.env: load_recipe(dataset.env).env_spec() for dataset in bench.grid.datasets if dataset.env}
-    chosen = bench.variants[0][0].env_spec
-    env_specs = {"": chosen} if chosen else env_specs or {"": _recorded_env_spec(bench.grid.datasets[0])}
-    step_time = float(np.mean([step_seconds(env_spec) for env_spec in env_specs.values()]))
-    return next(iter(env_specs.values())), step_time  # the shapes differ little
+    if chosen := bench.variants[0][0].env_spec:
+        env_specs = [chosen]
+    else:
+        envs = dict.fromkeys(dataset.env for dataset in bench.grid.datasets if dataset.env)
+        env_specs = [load_recipe(env).env_spec() for env in envs] or [_recorded_env_spec(bench.grid.datasets[0])]
+    return env_specs[0], float(np.mean([step_seconds(env_spec) for env_spec in env_specs]))  # the shapes differ little
 
 
 def _variant_cost(specs: Sequence[RunSpec], rate: Rate, run_seconds: float, env_spec: str, machine: Machine) -> Cost:
@@ -222,7 +223,7 @@ def _run_seconds(spec: RunSpec, rate: Rate, step_time: float, env_spec: str) -> 
     """Return the seconds of one run: its updates and its evaluations, full-length episodes assumed."""
     length = time_limit(parse_spec(env_spec)) or 1000
     episodes = -(-spec.steps // spec.eval_every) * spec.eval_episodes
-    return spec.steps / rate.updates + episodes * length * step_time
+    return spec.steps / rate.updates_per_second + episodes * length * step_time
 
 
 def _recorded_env_spec(dataset: GridDataset) -> str:

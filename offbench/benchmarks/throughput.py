@@ -36,11 +36,11 @@ class Rate:
     """What one algorithm costs on one device.
 
     Attributes:
-        updates: updates per second, summed over the runs of a stack.
+        updates_per_second: updates per second, summed over the runs of a stack.
         bytes_per_run: size of a checkpoint.
     """
 
-    updates: float
+    updates_per_second: float
     bytes_per_run: int
 
 
@@ -55,8 +55,7 @@ def measure(spec: RunSpec, env_spec: str, device: str) -> Rate:
         updates = 2 * TRACED_UPDATES
         while True:
             began, first = time.perf_counter(), stack.step
-            for _ in stack.train(first + updates):
-                pass
+            stack.train(first + updates)
             stack.captured_update.logged()  # waits for the device
             spent = time.perf_counter() - began
             if spent >= SECONDS and first:
@@ -72,11 +71,9 @@ def operations(spec: RunSpec, env_spec: str) -> float:
 
     stack = random_stack(load_algorithm(spec.algorithm), [spec.config], env_spec)
     stack.captured_update.eager = True
-    for _ in stack.train(2 * TRACED_UPDATES):  # past work that is done only once
-        pass
+    stack.train(2 * TRACED_UPDATES)  # past work that is done only once
     with matmul_backend("pytorch"), FlopCounterMode(display=False) as counter:
-        for _ in stack.train(2 * TRACED_UPDATES + COUNTED):
-            pass
+        stack.train(2 * TRACED_UPDATES + COUNTED)
     return float(counter.get_total_flops()) / COUNTED
 
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 Array = npt.NDArray[Any]
 
 
-def content_sha256(arrays: Mapping[str, Array], state: Mapping[str, object]) -> str:
+def arrays_sha256(arrays: Mapping[str, Array], state: Mapping[str, object]) -> str:
     """Return the SHA-256 of named arrays and of a JSON state, which detects any changed bit."""
     plain = json.loads(json.dumps(state))  # the form in which it is read back: lists for tuples, text for keys
     content = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())

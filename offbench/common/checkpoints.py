@@ -11,7 +11,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save
 
-from offbench.common.arrays import content_sha256
+from offbench.common.arrays import arrays_sha256
 from offbench.common.errors import DamagedError
 from offbench.common.files import JsonObject, open_regular, read_errors, write_bytes
 from offbench.common.terminal import inform
@@ -75,7 +75,7 @@ def _check_state(state: JsonObject) -> None:
 
 
 def _sha256(tensors: dict[str, torch.Tensor], state: JsonObject) -> str:
-    return content_sha256({name: tensor.numpy() for name, tensor in tensors.items()}, state)
+    return arrays_sha256({name: tensor.numpy() for name, tensor in tensors.items()}, state)
 
 
 def load_newest(folder: Path) -> tuple[dict[str, torch.Tensor], JsonObject] | None:

@@ -17,7 +17,8 @@ from pathlib import Path
 from offbench.common.files import sha256
 
 LEFT_OUT = {tokenize.COMMENT, tokenize.NL, tokenize.ENCODING, tokenize.ENDMARKER}
-PART_OF = ": "  # in names of what earlier versions did not record: what a class of a script or a MuJoCo model uses
+# `WHOLE: PART` names what a class of a script, or a MuJoCo model, uses; earlier versions recorded the wholes only
+PART_OF = ": "
 MAIN = f"__main__{PART_OF}"
 
 
@@ -27,9 +28,8 @@ def describe_changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
         return ""
     if not set(before) & set(now):
         return f"{', '.join(before)}, not {', '.join(now)}"
-    differ = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-    recorded = {_whole(name) for name in before}
-    differ = [name for name in differ if _whole(name) in recorded or not _whole(name)]
+    recorded = {"", *map(_whole, before)}  # parts count if `before` has parts of the same whole
+    differ = [name for name in {**before, **now} if before.get(name) != now.get(name) and _whole(name) in recorded]
     return ", ".join(f"{name} {_describe_change(before.get(name), now.get(name))}" for name in differ)
 
 
@@ -43,7 +43,8 @@ def _describe_change(before: str | None, now: str | None) -> str:
         return "is gone"
     if before is None:
         return "is new"
-    return f"was {before}, is {now}" if len(now) < 64 else "has changed"
+    is_version = len(now) < 64
+    return f"was {before}, is {now}" if is_version else "has changed"
 
 
 def module_code(name: str) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Files that are complete or absent: written to a temporary file, flushed to disk, then renamed."""
+"""Files: written whole or not at all, read with errors of one line, and locked while a process writes."""
 
 from __future__ import annotations
 

@@ -18,10 +18,10 @@ from offbench.common.terminal import inform
 from offbench.data import minari_store, minari_writer
 from offbench.data.behaviour_policy import level_name
 from offbench.data.card import compare_with_card
-from offbench.data.levels import Part, parse_level, parse_mix
+from offbench.data.levels import POLICY, WITHOUT_AGENT, Part, parse_level, parse_mix
 from offbench.data.minari_reader import open_minari
 from offbench.data.other_references import warn_other_references
-from offbench.data.recording import POLICY, WITHOUT_AGENT, Recording
+from offbench.data.recording import Recording
 from offbench.envs.environment_code import environment_code
 from offbench.envs.margin_rule import LAST_WITH_MAX_RULE, MARGIN_KEY, MAX_RULE, MUJOCO_VERSIONS, without_margin
 from offbench.envs.physics import same_physics
@@ -93,15 +93,14 @@ def collect(
         raise OffbenchError(f"steps must be at least 1, not {steps}")
     workers = default_workers(workers)
 
-    def prepare(ladder: Ladder | None) -> tuple[Recording, JsonObject]:
-        recording = Recording(recipe, parts, ladder, seed, workers, policy_source, steps=steps, accept=accept)
-        return recording, _metadata(recording, dataset_id, mix or level)
+    def recording_with(ladder: Ladder | None) -> Recording:
+        return Recording(recipe, parts, ladder, seed, workers, policy_source, steps=steps, accept=accept)
 
     ladder = find_ladder(recipe, Path(behaviour_dir), retrain)
     has_agent = ladder is not None or all(part.source in WITHOUT_AGENT for part in parts)
-    prepared = prepare(ladder) if has_agent else None
-    if prepared and not overwrite and minari_store.exists(dataset_id) and _is_same(dataset_id, prepared[1]):
-        if prepared[0].calls_function:
+    recording = recording_with(ladder) if has_agent else None
+    if recording and not overwrite and _is_recorded(recording, dataset_id, mix or level):
+        if recording.calls_function:
             raise OffbenchError(
                 f"{dataset_id} is recorded already, but {policy} may act differently now (a function can read files); "
                 "record it again with --overwrite, or another dataset with --name"
@@ -110,10 +109,10 @@ def collect(
         inform(f"{dataset_id} is recorded already, from the same policies and seed")
         return dataset_id
     with minari_store.claimed(dataset_id, overwrite) as path:
-        if prepared is None:
+        if recording is None:
             ladder = _train(env, Path(behaviour_dir), workers)
-            prepared = prepare(ladder)
-        recording, metadata = prepared
+            recording = recording_with(ladder)
+        metadata = _metadata(recording, dataset_id, mix or level)
         total = sum(recording.counts)
         with Progress(total, f"recording {dataset_id}") as progress:
             episodes = _counted(recording.episodes(), progress)
@@ -125,13 +124,17 @@ def collect(
     return dataset_id
 
 
-def _is_same(dataset_id: str, wanted: JsonObject) -> bool:
-    """Return whether a dataset was recorded with the same metadata as `wanted`, on the installed physics.
+def _is_recorded(recording: Recording, dataset_id: str, level: str) -> bool:
+    """Return whether there is a dataset of this id that was recorded in the same way, on the installed physics.
 
     Raises:
         DamagedError: its data cannot be opened.
+        OffbenchError: it is the same but for the code of its environment.
     """
+    if not minari_store.exists(dataset_id):
+        return False
     recorded = minari_store.read_provenance(minari_store.read_metadata(dataset_id))
+    wanted = _metadata(recording, dataset_id, level)
     as_written = json.loads(json.dumps({minari_store.KEY: wanted[minari_store.KEY]}))
     new = minari_store.read_provenance(as_written)
     same = all(recorded.versions.get(name) == new.versions.get(name) for name in PHYSICS)

@@ -102,7 +102,7 @@ def _export_metadata(path: Path, file: h5py.File) -> JsonObject:
     try:
         about = json.loads(text)
         fields = {key: about[key] for key in KEPT if key in about}
-        valid = all(isinstance(fields.get(key, ""), str) for key in _STRINGS)
+        valid = all(isinstance(fields.get(key, ""), str) for key in minari_store.TEXTS)
         valid = valid and all(all(isinstance(item, str) for item in fields.get(key, [])) for key in _LISTS)
         valid = valid and all(math.isfinite(fields.get(key, 0)) for key in NUMBERS)
         if not valid or not isinstance(fields.get(minari_store.KEY, {}), dict):
@@ -118,7 +118,6 @@ def _export_metadata(path: Path, file: h5py.File) -> JsonObject:
     return fields | {"spaces": spaces}
 
 
-_STRINGS = ("env_spec", "eval_env_spec", "observation_space", "action_space", "algorithm_name", "description")
 _LISTS = ("author", "author_email", "requirements")
 NUMBERS = ("ref_min_score", "ref_max_score", "num_episodes_average_score")
-KEPT = (*_STRINGS, *_LISTS, *NUMBERS, minari_store.KEY)  # Minari's metadata in a file that offbench exported
+KEPT = (*minari_store.TEXTS, *_LISTS, *NUMBERS, minari_store.KEY)  # Minari's metadata in a file that offbench exported

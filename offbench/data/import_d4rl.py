@@ -192,27 +192,9 @@ def _ends(source: Source, origin: _Origin) -> dict[int, tuple[bool, bool]]:
     if "timeouts" in source.columns:
         timeouts |= flags(source.read("timeouts", 0, count), f"{source.path}: timeouts")
     stops = terminals | (_broken(source) if complete else timeouts)
-    if "timeouts" not in source.columns:
-        stops[-1] = True
-        limit, begin, resets = origin.limit, 0, 0
-        starts = _starts(source, origin) if not complete else np.zeros(count + 1, bool)
-        if limit is None and not complete:
-            raise OffbenchError(
-                f"{source.path} has no timeouts, and its environment no time limit to cut the episodes at; add the "
-                "column timeouts, or give an --env with a limit ([env_kwargs] max_episode_steps)"
-            )
-        if limit is not None:
-            for last in np.flatnonzero(stops | starts[1:]).tolist():
-                # an unflagged reset is the clock's: late in an episode, or at the end of one that the file cuts off
-                late = (last + 1 - begin) % limit >= limit // 2 or (begin == 0 and not starts[0])
-                if stops[last] or late:
-                    resets += not stops[last]
-                    stops[last] = True
-                    timeouts[begin + limit - 1 : last + 1 : limit] = True
-                    begin = last + 1
-        if resets:
-            inform(f"{source.path} has {resets:,} resets within what its flags call one episode; cut there")
     stops[-1] = True
+    if "timeouts" not in source.columns:
+        _cut_at_limit(source, origin, stops, timeouts)
     unflagged = int((stops & ~terminals & ~timeouts)[:-1].sum())
     if complete and 2 * unflagged > count:
         warn(
@@ -221,6 +203,35 @@ def _ends(source: Source, origin: _Origin) -> dict[int, tuple[bool, bool]]:
         )
     last_rows = np.flatnonzero(stops | timeouts)
     return {int(i): (bool(terminals[i]), bool(timeouts[i] or not terminals[i])) for i in last_rows}
+
+
+def _cut_at_limit(source: Source, origin: _Origin, stops: Array, timeouts: Array) -> None:
+    """Cut the episodes of a file without timeouts, in place: at the environment's time limit, and at unflagged resets.
+
+    Args:
+        stops: whether each row [rows] is the last one of an episode; set at the resets.
+        timeouts: whether the time limit ends an episode with each row [rows]; set at the limits.
+    """
+    limit, complete = origin.limit, "next_observations" in source.columns
+    starts = np.zeros(len(source) + 1, bool) if complete else _starts(source, origin)
+    if limit is None:
+        if complete:
+            return
+        raise OffbenchError(
+            f"{source.path} has no timeouts, and its environment no time limit to cut the episodes at; add the "
+            "column timeouts, or give an --env with a limit ([env_kwargs] max_episode_steps)"
+        )
+    begin, resets = 0, 0
+    for last in np.flatnonzero(stops | starts[1:]).tolist():
+        # an unflagged reset is the clock's: late in an episode, or at the end of one that the file cuts off
+        late = (last + 1 - begin) % limit >= limit // 2 or (begin == 0 and not starts[0])
+        if stops[last] or late:
+            resets += not stops[last]
+            stops[last] = True
+            timeouts[begin + limit - 1 : last + 1 : limit] = True
+            begin = last + 1
+    if resets:
+        inform(f"{source.path} has {resets:,} resets within what its flags call one episode; cut there")
 
 
 def _broken(source: Source) -> Array:
@@ -336,12 +347,13 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
         before = evaluation_spec(about)
         if before and not same_environment(before, origin.evaluated):
             warn(f"--env names another environment than {source.path} does, so its reference scores are left out")
-            metadata = {key: value for key, value in metadata.items() if key not in ("ref_min_score", "ref_max_score")}
-            provenance = {key: value for key, value in provenance.items() if key not in ("references", MARGIN_KEY)}
+            for key in ("ref_min_score", "ref_max_score"):
+                metadata.pop(key, None)
+            for key in ("references", MARGIN_KEY):
+                provenance.pop(key, None)
             provenance["d4rl"] = d4rl_reference_of_env(metadata["eval_env_spec"])
         if rule == SUM_RULE:
             provenance[MARGIN_KEY] = rule
-        metadata[minari_store.KEY] = provenance
     return metadata, _spaces(source, origin.recipe)
 
 

@@ -15,8 +15,8 @@ class Part:
     """A share of a dataset and where it comes from.
 
     Attributes:
-        source: `uniform` actions, the `medium` or `expert` rung, the `replay` of training, or a fraction
-            such as "0.6" for the rung nearest to it.
+        source: `uniform` actions, the `medium` or `expert` rung, the `replay` of training, a fraction such as "0.6"
+            for the rung nearest to it, or a `policy` of the user's own.
         weight: number of transitions, as a multiple of the recipe's `dataset_steps`.
     """
 
@@ -24,6 +24,8 @@ class Part:
     weight: float = 1.0
 
 
+POLICY = "policy"
+WITHOUT_AGENT = ("uniform", POLICY)  # sources that need no behaviour agent
 FRACTION = r"\d+(?:p\d+)?percent"  # the name of a fraction in a dataset id: 60percent, 12p5percent
 
 LEVELS: dict[str, tuple[Part, ...]] = {  # sorted by mean return
@@ -59,7 +61,10 @@ def env_and_level(dataset_id: str) -> tuple[str, str]:
 
 
 def recipe_and_level(dataset_id: str) -> tuple[str, str]:
-    """Return the shipped recipe and the `--level` that an id such as `hopper-60percent-v0` names, else ("", "")."""
+    """Return the shipped recipe that an id such as `hopper-60percent-v0` begins with, and the `--level` after it.
+
+    What is after it need not be a level. The result is ("", "") if the id begins with no recipe.
+    """
     body = dataset_id.rpartition("-v")[0]
     for env in sorted(shipped_recipes(), key=len, reverse=True):
         level = body.removeprefix(f"{env}-")

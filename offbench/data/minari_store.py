@@ -194,7 +194,11 @@ def _check_fields(metadata: JsonObject) -> None:
 
 
 def exists(dataset_id: str) -> bool:
-    """Return whether there is a local dataset of this id, damaged or not. Raises OffbenchError if that is unknown."""
+    """Return whether there is a local dataset of this id, damaged or not; restore it if its replacement was killed.
+
+    Raises:
+        OffbenchError: that is unknown.
+    """
     path = root() / dataset_id / "data" / "metadata.json"
     with read_errors(str(path), "cannot be looked up", "check the id and the disk"):
         return _inside(dataset_id) and (path.exists() or (_restore_replaced(root() / dataset_id) and path.exists()))
@@ -254,8 +258,7 @@ def claimed(dataset_id: str, overwrite: bool) -> Iterator[Path]:
         raise OffbenchError(f"{dataset_id} leads out of {root()} by a link; choose another id")
     _check_nesting(dataset_id, path)
     with exclusive_lock(hidden_path(path, "lock"), f"{dataset_id} is being recorded"):
-        with write_errors(str(path)):
-            recover(path)
+        recover(path)
         if path.exists() and not overwrite:
             message = f"{dataset_id} exists already{_size(dataset_id)}"
             raise OffbenchError(f"{message}; use --overwrite to replace it, or --id for another id")
@@ -290,7 +293,6 @@ def _tidy(path: Path, timeout: float) -> None:
     with (
         contextlib.suppress(OffbenchError),
         exclusive_lock(hidden_path(path, "lock"), path.name, timeout),
-        write_errors(str(path)),
     ):
         recover(path)
 

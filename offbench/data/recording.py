@@ -14,16 +14,13 @@ from offbench.common.files import JsonObject, sha256
 from offbench.common.processes import blocking_workers
 from offbench.common.terminal import inform
 from offbench.data.behaviour_policy import BehaviourPolicy, read_behaviour_policy
-from offbench.data.levels import Part, full_size, shares
+from offbench.data.levels import WITHOUT_AGENT, Part, full_size, shares
 from offbench.envs.contact_margins import has_margins, model_of
 from offbench.envs.environments import make_env, spaces_of
 from offbench.envs.recipes import Recipe
 from offbench.rollouts.function_policy import FunctionPolicy
 from offbench.rollouts.policy import Policy, uniform_policy
 from offbench.rollouts.rollouts import Episode, Rollouts
-
-POLICY = "policy"  # the source of a part that a user's own policy plays
-WITHOUT_AGENT = ("uniform", POLICY)  # sources that need no behaviour agent
 
 
 class Recording:
@@ -61,7 +58,8 @@ class Recording:
         env = make_env(self.env_spec)
         model = model_of(env)
         self.uses_mujoco, self.has_margins = model is not None, model is not None and has_margins(model)
-        self.spaces = self.observation_space, action_space = spaces_of(env, recipe.env_id)
+        self.spaces = spaces_of(env, recipe.env_id)
+        self.observation_space, action_space = self.spaces
         self.bounds = action_space.low, action_space.high
         self.own_policy: BehaviourPolicy | None = None
         if policy_source is not None:
@@ -112,12 +110,13 @@ class Recording:
     def _rung(self, part: Part, accept: bool) -> Rung | None:
         if part.source in WITHOUT_AGENT:
             return None
-        if part.source not in ("medium", "replay", "expert"):
-            return self._nearest(float(part.source), accept)
-        rung = self.ladder.role("expert" if part.source == "expert" else "medium")
-        if part.source != "expert":
+        if part.source == "expert":
+            return self.ladder.role("expert")
+        if part.source in ("medium", "replay"):
+            rung = self.ladder.role("medium")
             self._check_medium(rung, accept)
-        return None if part.source == "replay" else rung
+            return rung if part.source == "medium" else None  # the replay ends at this rung, which does not play it
+        return self._nearest(float(part.source), accept)
 
     def _nearest(self, fraction: float, accept: bool) -> Rung:
         rung = self.ladder.nearest(fraction)
@@ -174,17 +173,17 @@ class Recording:
         return ", then ".join(map(self._part_origin, self.parts, self.rungs))
 
     def _part_origin(self, part: Part, rung: Rung | None) -> str:
-        if part.source == "uniform":
-            return "uniform-random actions"
-        if self.own_policy is not None:
-            return f"the policy {self.own_policy.source}"
-        if rung is None:
+        if part.source == "replay":
             fraction = self.ladder.fraction(self.ladder.role("medium"))
             info, which = self.ladder.info, ""
             if info.medium_replay.envs:
                 which = f" ({info.medium_replay.envs} of its {info.sac['envs']} environments)"
             until = f"up to its medium policy, at {fraction:.2f} of the expert's return"
             return f"the replay of SAC's training{which} {until}"
+        if self.own_policy is not None:
+            return f"the policy {self.own_policy.source}"
+        if rung is None:
+            return "uniform-random actions"
         fraction = self.ladder.fraction(rung)
         return f"SAC's policy of training step {rung.step}, at {fraction:.2f} of the expert's return"
 

@@ -277,9 +277,8 @@ def _delete_earlier_conversions(source: str) -> None:
     for meta in cache().glob("*/meta.json"):
         with contextlib.suppress(OffbenchError):  # another dataset's, which is damaged
             if read_json(meta).get("source") == source:
-                temporary = meta.parent.with_name(
-                    f".{meta.parent.name}.old"
-                )  # removed by `_remove_leftovers` after a kill
+                # removed by `_remove_leftovers` after a kill
+                temporary = meta.parent.with_name(f".{meta.parent.name}.old")
                 with contextlib.suppress(OSError):
                     meta.parent.replace(temporary)
                     shutil.rmtree(temporary)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import base64
-import importlib.resources
-import re
-from pathlib import Path
 
 from offbench.analysis.results import Results, Task
 from offbench.common.errors import OffbenchError
@@ -13,6 +10,7 @@ from offbench.common.files import JsonObject, read_json
 from offbench.common.tables import Cell, Table
 from offbench.common.terminal import warn
 from offbench.data import minari_store, transitions
+from offbench.envs.recipes import recipes_folder, shipped_recipes
 from offbench.reports.markup import Markup, join, tag
 from offbench.reports.page import table_html
 from offbench.reports.tables import EMPTY
@@ -65,10 +63,10 @@ def cards(results: Results) -> list[Markup]:
 
 def _card(env: str) -> Markup | None:
     """Return an environment's shipped dataset card, None where there is none."""
-    if not re.fullmatch(r"[a-z0-9_-]+", env):
+    if env not in shipped_recipes():
         return None
-    folder = importlib.resources.files("offbench") / "datasets" / env
-    card, picture = Path(str(folder / "card.json")), Path(str(folder / "card.png"))
+    folder = recipes_folder() / env
+    card, picture = folder / "card.json", folder / "card.png"
     if not card.exists():
         return None
     facts = read_json(card)
@@ -89,7 +87,6 @@ def _facts(values: JsonObject) -> list[Cell]:
         *(Cell(f"{values[key]:,}", values[key]) for key in ("transitions", "episodes")),
         *(Cell(f"{values[key]:,.1f}", values[key]) for key in ("return", "std", "score")),
         Cell(f"{100 * values['terminated']:.1f}%", values["terminated"]),
-        Cell(
-            next(iter(values["content_sha256"].values()))[:SHOWN]
-        ),  # hash of the recording that the statistics describe
+        # the hash of the recording that the statistics describe
+        Cell(next(iter(values["content_sha256"].values()))[:SHOWN]),
     ]

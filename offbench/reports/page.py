@@ -28,6 +28,9 @@ class Section:
     intro: str = ""
 
 
+GENERATOR = tag("meta", name="generator", content="offbench")  # identifies an older report, which may be replaced
+
+
 def page(title: str, lead: Markup, sections: Sequence[Section], dialogs: Sequence[Markup]) -> bytes:
     """Return the whole page. Nothing but its own script may run, and nothing may be fetched."""
     style, script = (_asset(name) for name in ("report.css", "report.js"))
@@ -38,7 +41,7 @@ def page(title: str, lead: Markup, sections: Sequence[Section], dialogs: Sequenc
         tag("meta", charset="utf-8"),
         tag("meta", http_equiv="Content-Security-Policy", content=policy),
         tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        tag("meta", name="generator", content="offbench"),
+        GENERATOR,
         tag("meta", name="color-scheme", content="light dark"),
         tag("title", title),
         tag("style", Markup(style)),

@@ -24,14 +24,13 @@ from offbench.reports import figures, tables
 from offbench.reports.datasets import cards, dataset_table
 from offbench.reports.figures import Figure
 from offbench.reports.markup import Markup, join, tag
-from offbench.reports.page import Section, dialogs_html, figures_html, page, relative, table_html
+from offbench.reports.page import GENERATOR, Section, dialogs_html, figures_html, page, relative, table_html
 from offbench.reports.similarity import similarity_tables
 from offbench.reports.sweep import best_table
 from offbench.reports.tables import is_papers_grid, scale
 
 PAGE = "index.html"
 TITLE = "Offline RL benchmark"
-GENERATOR = '<meta name="generator" content="offbench">'  # identifies an older report, which may be replaced
 STATES = {"unfinished": ("is unfinished", "are unfinished"), "diverged": ("diverged", "diverged")}
 
 
@@ -84,10 +83,10 @@ def _earlier_files(folder: Path) -> set[Path]:
     """Return the tables and figures of an older report. Raises OffbenchError if it holds another program's page."""
     if folder.exists() and not folder.is_dir():
         raise OffbenchError(f"{folder} is a file; give another --out")
-    page = folder / PAGE
+    path = folder / PAGE
     try:
-        with read_errors(str(page), "is not a report of offbench", "give another --out"):
-            if GENERATOR.encode() not in read_bytes(page):
+        with read_errors(str(path), "is not a report of offbench", "give another --out"):
+            if GENERATOR.encode() not in read_bytes(path):
                 raise ValueError("it lacks the generator tag of offbench")
     except FileNotFoundError:
         return set()

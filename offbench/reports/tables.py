@@ -351,15 +351,8 @@ def seed_table(results: Results) -> Table:
     for waiting in results.unevaluated:
         config = waiting.config()
         texts = [_waiting_name(results, config), f"{config.algorithm} {config.variant}".removesuffix(" default")]
-        numbers = [
-            Cell(str(config.seed)),
-            EMPTY,
-            EMPTY,
-            EMPTY,
-            Cell("0", 0),
-            Cell("0", 0),
-            Cell(f"{config.steps:,}"),
-        ]
+        seed, steps = Cell(str(config.seed), config.seed), Cell(f"{config.steps:,}", config.steps)
+        numbers = [seed, *[EMPTY] * 3, *[Cell("0", 0)] * 2, steps]
         rows.append([*map(Cell, texts), *numbers, Cell("diverged" if waiting.diverged else "not evaluated yet")])
     header = ["dataset", "method", "seed", "score", "return", "reference", "evaluations", "step", "of", "state"]
     return Table("seeds", "Every run", header, rows, [], 3)

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from offbench.common.arrays import Array, content_sha256
+from offbench.common.arrays import Array, arrays_sha256
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, read_bytes, read_errors, write_bytes
 
@@ -199,7 +199,7 @@ class Policy:
             "activation": self.activation,
         }
         arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in tensors.items()}
-        header["sha256"] = content_sha256(arrays, header)
+        header["sha256"] = arrays_sha256(arrays, header)
         return bytes(save(arrays, metadata={"offbench": json.dumps(header, sort_keys=True)}))
 
     def save(self, path: Path) -> None:
@@ -247,7 +247,7 @@ def from_bytes(data: bytes) -> Policy:
         raise ValueError(f"not safetensors ({error})") from None
     header = _header(data)
     recorded = header.pop("sha256", None)  # older files have none
-    if recorded is not None and recorded != content_sha256(tensors, header):
+    if recorded is not None and recorded != arrays_sha256(tensors, header):
         raise ValueError("its content is not what was written (SHA-256)")
     if header.get("format") != "offbench-policy-1":
         raise ValueError(f"unknown format {header.get('format')!r}")

@@ -124,7 +124,8 @@ def draw_chunk(
     device: torch.device,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return a chunk's batch indices [CHUNK, runs, batch] and noise {name: [CHUNK, runs, *shape]}."""
-    indices, noise = [], {name: [] for name in noise_spec}  # type: tuple[list[Tensor], dict[str, list[Tensor]]]
+    indices: list[Tensor] = []
+    noise: dict[str, list[Tensor]] = {name: [] for name in noise_spec}
     for seed, size in zip(run_seeds, sizes, strict=True):
         generator = torch.Generator(device).manual_seed(seeds.integer(seed, Purpose.CHUNK, chunk))
         indices.append(torch.randint(size, (CHUNK, batch_size), generator=generator, device=device))

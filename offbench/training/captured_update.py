@@ -43,7 +43,7 @@ class CapturedUpdate:
         self._traces: dict[Hashable, Trace] = {}
         self._done: dict[Hashable, int] = {}  # updates of each phase
         self._count = 0  # updates in this session
-        self._lost = ""  # an attribute that the updates change and no checkpoint keeps
+        self._has_reported = False  # an attribute that the updates change and no checkpoint keeps
         self.eager = not algorithm.capture  # whether every update runs without capture
         self._side_stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
 
@@ -75,8 +75,8 @@ class CapturedUpdate:
     def _report_lost_attribute(self, before: dict[str, object]) -> None:
         """Print which attribute an update changes that no checkpoint keeps, once."""
         changed = changed_attribute(before, attributes(self.algorithm, in_place=True), first=True)
-        if changed and not self._lost:
-            self._lost = changed
+        if changed and not self._has_reported:
+            self._has_reported = True
             name = type(self.algorithm).__name__
             inform(
                 f"{name}.update changes the attribute {changed}, which no checkpoint keeps: a resumed run begins with "

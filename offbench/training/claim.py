@@ -87,7 +87,7 @@ def _check_environment(spec: RunSpec, data: Transitions) -> None:
 
 def _check_evaluations(spec: RunSpec) -> None:
     """Refuse a run that lacks an evaluation before its newest checkpoint: resuming it would give another score."""
-    newest = max(checkpoints.steps(spec.folder), default=0)
+    newest = spec.run.newest_checkpoint()
     last = (newest - 1) // spec.eval_every * spec.eval_every  # the one of `newest` itself may not have finished
     if last > 0 and last not in spec.run.evaluations():
         raise OffbenchError(

@@ -6,6 +6,7 @@ Groups fit the device and leave no process idle. They do not depend on what is t
 from __future__ import annotations
 
 import gc
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -39,7 +40,8 @@ def group(specs: Sequence[RunSpec], datasets: Datasets, machine: Machine) -> lis
             size = machine.stack
             if isinstance(size, str):
                 size = stack_size(runs[0], datasets[runs[0].dataset], machine.device)
-            count = min(len(runs), -(-len(runs) // size // share) * share)
+            rounds = math.ceil(math.ceil(len(runs) / size) / share)  # in each, every process of the share trains a job
+            count = min(len(runs), rounds * share)
             for indices in np.array_split(np.arange(len(runs)), count):
                 jobs.append(Job(tuple(runs[i] for i in indices), machine.device, workers))
     return jobs
@@ -58,8 +60,7 @@ def stack_size(spec: RunSpec, data: Transitions, device: str) -> int:
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_reserved(device)
         stack = Stack(load_algorithm(spec.algorithm), [spec] * runs, {spec.dataset: data}, device)
-        for _ in stack.train(4 * WARM_UP):
-            pass
+        stack.train(4 * WARM_UP)
         peaks.append(torch.cuda.max_memory_reserved(device) - before)
         del stack
         gc.collect()

@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
+from typing import NamedTuple
 
 from offbench.common.errors import OffbenchError
 from offbench.common.interrupts import announce_stop
@@ -89,7 +90,7 @@ class JobProgress(Progress):
     def report(self, index: int, step: int, note: str) -> None:
         """Show that a job is at `step`, and say where it resumed and where it was stopped.
 
-        It must be called for each of a job's reports.
+        It must get every report of a job: the first one says where it resumed, the last one whether it was stopped.
         """
         if index not in self.steps and step:
             self.print_line(f"{self.titles[index]}: resuming from step {step:,}")
@@ -136,6 +137,13 @@ def _problem(job: Job, error: Exception, write_traceback: Callable[[str], object
     )
 
 
+class _End(NamedTuple):
+    """The last message of a training process; those before it are its (step, note)."""
+
+    problems: list[str]
+    trace: str = ""
+
+
 class _Pool(contextlib.AbstractContextManager["_Pool"]):
     """The training processes; leaving the context ends them, each with a checkpoint."""
 
@@ -166,8 +174,8 @@ class _Pool(contextlib.AbstractContextManager["_Pool"]):
         try:
             for receiver, (index, _) in list(self.active.items()):
                 with contextlib.suppress(EOFError, OSError):  # the process has ended
-                    while (message := receiver.recv())[0] is not None:
-                        self.progress.report(index, *message[:2])
+                    while not isinstance(message := receiver.recv(), _End):
+                        self.progress.report(index, *message)
                 self.end(receiver)
         except KeyboardInterrupt:
             for process in processes:
@@ -187,24 +195,23 @@ def _train_in_processes(jobs: Sequence[Job], processes: int, pool: _Pool) -> Ite
             assert isinstance(receiver, Connection)
             index = pool.active[receiver][0]
             try:
-                step, note, lines = receiver.recv()
+                message = receiver.recv()
             except EOFError:
-                step, note = None, ""
-                lines = [f"a training process died (killed, or out of memory): {jobs[index].title}"]
-            if step is not None:
-                pool.progress.report(index, step, note)
+                message = _End([f"a training process died (killed, or out of memory): {jobs[index].title}"])
+            if not isinstance(message, _End):
+                pool.progress.report(index, *message)
                 continue
-            pool.progress.print_trace(note)
-            yield from lines
+            pool.progress.print_trace(message.trace)
+            yield from message.problems
             pool.end(receiver)
 
 
 def _worker(job: Job, sender: Connection, parent: int) -> None:
-    """Train in a process: send (step, note, None) at each progress, then (None, traceback or "", problems)."""
+    """Train in a process: send (step, note) at each progress, then an _End."""
     start_worker(parent)
     traces: list[str] = []
     try:
-        lines = train_job(job, lambda step, note: sender.send((step, note, None)))
+        lines = train_job(job, lambda step, note: sender.send((step, note)))
     except Exception as error:
         lines = [_problem(job, error, traces.append)]
-    sender.send((None, "".join(traces), lines))
+    sender.send(_End(lines, "".join(traces)))

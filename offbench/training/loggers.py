@@ -52,14 +52,14 @@ NO_LOGGERS = LoggerOptions()
 class Loggers(contextlib.AbstractContextManager["Loggers"]):
     """The loggers of a job's runs, open while it trains."""
 
-    def __init__(self, runs: Sequence[Run], loggers: LoggerOptions) -> None:
-        self.runs, self.options = list(runs), loggers
-        self.loggers: list[list[TensorBoard | WandB]] = [[] for _ in runs]
+    def __init__(self, runs: Sequence[Run], options: LoggerOptions) -> None:
+        self.runs, self.options = list(runs), options
+        self.of_runs: list[list[TensorBoard | WandB]] = [[] for _ in runs]
         self._closing = contextlib.ExitStack()  # closes all of them, also if one fails
 
     def __enter__(self) -> Loggers:
         with contextlib.ExitStack() as opened:
-            for run, loggers in zip(self.runs, self.loggers, strict=True):
+            for run, loggers in zip(self.runs, self.of_runs, strict=True):
                 if self.options.tensorboard:
                     loggers.append(opened.enter_context(contextlib.closing(TensorBoard(run))))
                 if self.options.wandb is not None:
@@ -72,7 +72,7 @@ class Loggers(contextlib.AbstractContextManager["Loggers"]):
 
     def write(self, index: int, losses: Losses, evaluations: Evaluations) -> None:
         """Send all rows of the run at `index`."""
-        for logger in self.loggers[index]:
+        for logger in self.of_runs[index]:
             logger.write(losses, evaluations)
 
 

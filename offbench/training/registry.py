@@ -29,9 +29,8 @@ if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
 
 GROUP = "offbench.algos"
-USER_ALGORITHMS_VARIABLE = (
-    "OFFBENCH_OWN_ALGORITHMS"  # {name: "module:class"} as JSON, for the processes that this one starts
-)
+# {name: "module:class"} as JSON, for the processes that this one starts
+USER_ALGORITHMS_VARIABLE = "OFFBENCH_OWN_ALGORITHMS"
 _user_algorithms: dict[str, type[Algorithm]] = {}  # the user's own, registered in this process
 
 

@@ -12,25 +12,18 @@ import functools
 import inspect
 import sys
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
-from offbench.common.code_hash import MAIN
+from offbench.common.code_hash import MAIN, file_hash, imported_files, source_hash
 from offbench.common.files import sha256
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None))
 
 
-def script_code(
-    classes: list[type], source_hash: Callable[[str], str], file_hashes: Callable[[Path], dict[str, str]]
-) -> dict[str, str]:
-    """Return {name: hash} of classes of `__main__`, of what they use there, and of files beside it that they use.
-
-    Args:
-        source_hash: the hash of source text.
-        file_hashes: the hashes of a file and the files that it imports.
-    """
-    hashes = {cls.__qualname__: _hash(cls, source_hash) for cls in classes}
+def script_code(classes: list[type]) -> dict[str, str]:
+    """Return {name: hash} of classes of `__main__`, of what they use there, and of files beside it that they use."""
+    hashes = {cls.__qualname__: _hash(cls) for cls in classes}
     used: dict[str, object] = {}  # what is found is looked through in turn
     waiting: list[tuple[str, object]] = [item for cls in classes for item in _used_by_class(cls)]
     while waiting:
@@ -40,12 +33,13 @@ def script_code(
         used[name] = value
         if isinstance(value, types.FunctionType | type) and value.__module__ == "__main__":
             if not any(name.startswith(f"{cls.__qualname__}.") for cls in classes):  # else it is in the class's source
-                hashes[MAIN + name] = _hash(value, source_hash)
+                hashes[MAIN + name] = _hash(value)
             waiting += _used_by_class(value) if isinstance(value, type) else _used_by_function(value)
         elif _is_plain(value):
             hashes[MAIN + name] = sha256(repr(value).encode())
         elif file := _file_beside(value):
-            hashes |= {MAIN + path: found for path, found in file_hashes(file).items()}
+            for path in imported_files(file, file.parent, {}):
+                hashes[f"{MAIN}{path.relative_to(file.parent)}"] = file_hash(path)
     return hashes
 
 
@@ -94,7 +88,7 @@ def _is_plain(value: object) -> bool:
     return all(map(_is_plain, value)) if isinstance(value, list | tuple) else isinstance(value, PLAIN)
 
 
-def _hash(one: type | types.FunctionType, source_hash: Callable[[str], str]) -> str:
+def _hash(one: type | types.FunctionType) -> str:
     """Return the hash of a class's or function's source; where Python does not know it, that of the compiled code."""
     source = one if isinstance(one, type) else one.__code__  # for a decorated function, that of the decorator
     try:
@@ -103,7 +97,7 @@ def _hash(one: type | types.FunctionType, source_hash: Callable[[str], str]) -> 
         pass
     if isinstance(one, type):
         functions = [(name, value) for name, value in _used_by_class(one) if isinstance(value, types.FunctionType)]
-        parts = [f"{name} {_hash(function, source_hash)}" for name, function in functions]
+        parts = [f"{name} {_hash(function)}" for name, function in functions]
         if dataclasses.is_dataclass(one):
             parts += [f"{field.name} {field.default!r}" for field in dataclasses.fields(one)]
         return sha256("\n".join(parts).encode())

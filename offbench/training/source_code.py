@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from offbench.common.code_hash import file_hash, imported_files, module_code, package_versions, source_hash
+from offbench.common.code_hash import file_hash, imported_files, module_code, package_versions
 from offbench.training.registry import load_algorithm, user_algorithm
 from offbench.training.script_code import script_code
 
@@ -43,17 +43,12 @@ def _code_of(algorithm_class: type[Algorithm]) -> dict[str, str]:
         file = Path(getattr(module, "__file__", None) or "")
         package = cls.__module__.partition(".")[0]
         if cls.__module__ == "__main__" or not file.is_file():
-            hashes |= script_code([cls, algorithm_class.Config], source_hash, _beside)
+            hashes |= script_code([cls, algorithm_class.Config])
         elif package == "offbench":
             hashes[file.name] = file_hash(file)
         else:
             hashes |= module_code(cls.__module__)
     return dict(sorted(hashes.items()))
-
-
-def _beside(file: Path) -> dict[str, str]:
-    """Return the hashes of a file beside a script, and of the files that it imports."""
-    return {str(path.relative_to(file.parent)): file_hash(path) for path in imported_files(file, file.parent, {})}
 
 
 def _classes(algorithm_class: type[Algorithm]) -> Sequence[type]:

@@ -62,7 +62,12 @@ class Stack:
         self.captured_update = CapturedUpdate(self.algorithm, self.store)
         self.step = 0
 
-    def train(self, until: int) -> Iterator[int]:
+    def train(self, until: int) -> None:
+        """Update up to step `until`."""
+        for _ in self.train_in_chunks(until):
+            pass
+
+    def train_in_chunks(self, until: int) -> Iterator[int]:
         """Update up to step `until`; yields the step after every chunk (and at the end)."""
         while self.step < until:
             chunk, first = divmod(self.step, CHUNK)
@@ -163,6 +168,8 @@ def _check_policy(algorithm: Algorithm, observation_dim: int, action_dim: int) -
         ready = not any(x.requires_grad or x.is_cuda for layer in [*parts.layers, *parts.critic] for x in layer)
     except (ValueError, TypeError, AttributeError) as error:  # the last two: layers that are not pairs of tensors
         raise OffbenchError(f"{where}: {error}") from None
+    if not ready:
+        raise OffbenchError(f"{where}: layers must be detached and on the CPU, as `Network.layers` returns them")
     for name, network in vars(algorithm).items():
         if isinstance(network, Network) and network.norm == "none" and network.activation != parts.activation:
             for layers in (parts.layers, parts.critic):
@@ -171,8 +178,6 @@ def _check_policy(algorithm: Algorithm, observation_dim: int, action_dim: int) -
                         f"{where}: the layers of {name} have the activation {network.activation}, the policy "
                         f"{parts.activation}; give PolicyParts(..., activation={network.activation!r})"
                     )
-    if not ready:
-        raise OffbenchError(f"{where}: layers must be detached and on the CPU, as `Network.layers` returns them")
 
 
 def _equal(layers: Layers, others: Layers) -> bool:

@@ -22,10 +22,7 @@ from offbench.training.devices import Machine, pick_machine
 from offbench.training.grouping import group
 from offbench.training.jobs import raise_first, run_jobs
 from offbench.training.loggers import NO_LOGGERS, LoggerOptions
-from offbench.training.registry import (
-    load_algorithm,
-    only_in_this_process,
-)
+from offbench.training.registry import load_algorithm, only_in_this_process
 from offbench.training.spec import Job, RunSpec, TrainingSchedule, specs_of
 from offbench.training.stack import Stack
 
@@ -153,7 +150,7 @@ class Training:
         self.finished = len(specs) - len(self.diverged) - sum(len(job.specs) for job in self.jobs)
 
     def unfinished_jobs(self) -> list[Job]:
-        """Return what is left to train as the runs' folders are now."""
+        """Claim the runs' folders, and return what is left to train in them now."""
         return [
             left for job in self._all_jobs for left in claim_unfinished(job, self._datasets, command=self._command)
         ]
@@ -184,8 +181,7 @@ class Training:
 def _try_update(spec: RunSpec, datasets: Datasets) -> None:
     """Perform the first update of a run on the CPU, to check that its code works; discard the result."""
     stack = Stack(load_algorithm(spec.algorithm), [spec], {spec.dataset: datasets[spec.dataset]}, "cpu")
-    for _ in stack.train(1):
-        pass
+    stack.train(1)
 
 
 def _seed_list(seeds: int | Sequence[int]) -> tuple[int, ...]:

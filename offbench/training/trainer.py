@@ -96,12 +96,12 @@ class Trainer:
             if self._evaluates_at(self.stack.step) and self.stack.step:
                 self._start_evaluations()
             while self.stack.step < steps and len(self.diverged) < len(self.runs):
-                in_time = self._train_to(self._next_evaluation(), on_progress)
+                reached = self._train_to(self._next_evaluation(), on_progress)
                 self._mark_diverged()
                 self._finish_evaluations()  # evaluations of earlier steps are written first, so a resume misses none
-                if self.stack.step and (not in_time or self.stack.step == steps or self._checkpoint_is_due()):
+                if self.stack.step and (not reached or self.stack.step == steps or self._checkpoint_is_due()):
                     self._checkpoint()
-                if not in_time:
+                if not reached:
                     break
                 if self._evaluates_at(self.stack.step):
                     self._start_evaluations()
@@ -112,10 +112,10 @@ class Trainer:
         return list(self.diverged.values())
 
     def _train_to(self, stop: int, on_progress: OnProgress) -> bool:
-        """Train up to `stop`; return False if the deadline, Ctrl-C or SIGTERM came first."""
+        """Train up to `stop`; return whether it was reached, False if the deadline, Ctrl-C or SIGTERM came first."""
         if self.stops:
             return False
-        for step in self.stack.train(stop):
+        for step in self.stack.train_in_chunks(stop):
             late = self.job.deadline_passed and step < stop
             if step % LOG_EVERY == 0 or step == stop:
                 for rows, row in zip(self.losses, self.stack.captured_update.logged(), strict=True):

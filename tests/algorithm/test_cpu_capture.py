@@ -28,8 +28,7 @@ def stack_of(kind: type, runs: int = 1, device: str = "cpu", **settings: Any) ->
 
 
 def trained(stack: Stack, steps: int) -> tuple[dict[str, Tensor], list[dict[str, float]]]:
-    for _ in stack.train(steps):
-        pass
+    stack.train(steps)
     return {name: tensor.detach().clone() for name, tensor in stack.tensors().items()}, stack.captured_update.logged()
 
 

@@ -54,8 +54,7 @@ def learned(case: str) -> dict[str, Tensor]:
     config = build(kind.Config, small | settings, case)
     stack = random_stack(kind, [config, config], load_recipe("hopper").env_spec())
     with matmul_settings("cpu"):
-        for _ in stack.train(UPDATES):
-            pass
+        stack.train(UPDATES)
     return {name: tensor.detach().clone() for name, tensor in stack.tensors().items() if name.endswith("flat")}
 
 
