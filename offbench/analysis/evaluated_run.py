@@ -58,10 +58,11 @@ class EvaluatedRun:
         return "diverged" if self.files.diverged else "unfinished"
 
     def up_to(self, step: int) -> EvaluatedRun:
-        """Return the run as it was after `step` updates; a shorter one as it is."""
+        """Return the run as it was at its last evaluation within `step` updates; a shorter one as it is."""
+        every = self.config.eval_every or 1
         config = replace(
             self.config,
-            steps=min(step, self.config.steps),
+            steps=self.config.steps if step >= self.config.steps else step // every * every,
             sessions=tuple(session for session in self.config.sessions if session.step < step),
         )
         evaluations = {at: episodes for at, episodes in self.evaluations.items() if at <= step}

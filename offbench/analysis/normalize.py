@@ -139,15 +139,15 @@ def normalize(
     *,
     steps: int | None = None,
     env: str | Path | None = None,
-    returns: Sequence[float] = (),
+    returns: float | Sequence[float] = (),
 ) -> list[Row]:
-    """Score all runs below a folder; or, with `env`, score `returns` of that environment.
+    """Score all runs below a folder; or, with `env`, score one or several `returns` of that environment.
 
     With `steps`, the runs are scored as they were after so many updates (shorter ones as they are).
 
     Rows are dictionaries; `offbench.analysis.normalize.render(rows, "markdown")` prints them.
     """
-    returns = list(returns)
+    returns = list(returns) if isinstance(returns, Iterable) else [returns]
     if env is None:
         if returns:
             raise OffbenchError("returns need their environment: give --env, e.g. --env hopper 1234.5")

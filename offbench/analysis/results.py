@@ -190,6 +190,8 @@ def read_results(
         OffbenchError: none is evaluated, one is duplicated, or there is no such dataset or method. Damaged runs are
             named on stderr and left out.
     """
+    if steps is not None and steps < 1:
+        raise OffbenchError(f"steps must be at least 1, not {steps}")
     roots = tuple(map(Path, [runs] if isinstance(runs, str | Path) else runs))
     unique = {run.folder.resolve(): run for root in roots for run in find_runs(root)}
     entries, unevaluated = entries_of(unique.values(), datasets, steps=steps)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Protocol
 
 from offbench.benchmarks.datasets import record_dataset
@@ -25,8 +26,8 @@ UNITS = {"s": 1, "m": 60, "h": 3600}
 class Executor(Protocol):
     """Where recordings and trainings happen."""
 
-    def record(self, datasets: Sequence[GridDataset], workers: int) -> None:
-        """Record datasets. Raises OffbenchError if one cannot be recorded."""
+    def record(self, datasets: Sequence[GridDataset], workers: int, deadline: float | None = None) -> None:
+        """Record datasets, none after the deadline. Raises OffbenchError if one cannot be recorded."""
         ...
 
     def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
@@ -37,13 +38,10 @@ class Executor(Protocol):
 class LocalExecutor:
     """This machine's processes."""
 
-    def __init__(self, deadline: float | None = None) -> None:
-        self.deadline = deadline
-
-    def record(self, datasets: Sequence[GridDataset], workers: int) -> None:
+    def record(self, datasets: Sequence[GridDataset], workers: int, deadline: float | None = None) -> None:
         """Record datasets, one after the other, until the deadline."""
         for dataset in datasets:
-            if self.deadline is None or time.time() < self.deadline:
+            if deadline is None or time.time() < deadline:
                 record_dataset(dataset, workers)
 
     def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
@@ -52,9 +50,9 @@ class LocalExecutor:
 
 
 def benchmark(
-    grid: str | Benchmark,
+    grid: str | Path | Benchmark,
     *,
-    budget: str | None = None,
+    budget: str | float | None = None,
     shard: tuple[int, int] = (0, 1),
     executor: Executor | None = None,
     command: str = "",
@@ -65,7 +63,7 @@ def benchmark(
     Args:
         grid: a shipped grid's name such as `medium`, a file (`./mine.toml`), or what
             `offbench.benchmarks.plan.prepare` returns, which takes the folder, the device and the processes.
-        budget: "9m", "2h" or "90s": stops with checkpoints after that time; the same call resumes.
+        budget: "9m", "2h", "90s" or seconds: stops with checkpoints after that time; the same call resumes.
         shard: (i, n): the i-th of n shares of the runs, for machines with a shared file system.
         executor: this machine (default), or a cluster (`offbench.benchmarks.ray_executor.RayExecutor`).
         command: what the user typed, for each run's config.json.
@@ -77,11 +75,11 @@ def benchmark(
     Raises:
         OffbenchError: anything that the user can fix; runs that diverged, once all others are done.
     """
-    deadline = time.time() + _seconds(budget) if budget else None
-    executor = executor or LocalExecutor(deadline)
-    bench = prepare(grid) if isinstance(grid, str) else grid
+    deadline = time.time() + _seconds(budget) if budget is not None else None
+    executor = executor or LocalExecutor()
+    bench = grid if isinstance(grid, Benchmark) else prepare(grid)
     update_seconds = write_plan(bench, shard, say)
-    executor.record(bench.missing(), bench.machine.workers)
+    executor.record(bench.missing(), bench.machine.workers, deadline)
     if bench.missing():
         return False  # out of time
     specs = [spec for share in shard_of(bench, shard) for spec in share if not is_longer(spec)]
@@ -92,12 +90,12 @@ def benchmark(
     return not training.unfinished_jobs()
 
 
-def _seconds(text: str) -> float:
-    """Return the seconds of `9m`, `1.5h` or `90s`."""
+def _seconds(budget: str | float) -> float:
+    """Return the seconds of `9m`, `1.5h`, `90s` or a number."""
     try:
-        value = float(text[:-1]) * UNITS[text[-1]]
+        value = float(budget[:-1]) * UNITS[budget[-1]] if isinstance(budget, str) else float(budget)
     except (ValueError, KeyError, IndexError):
-        raise OffbenchError(f"a budget is a time like 9m, 1.5h or 90s, not {text!r}") from None
+        raise OffbenchError(f"a budget is a time like 9m, 1.5h or 90s, not {budget!r}") from None
     if not 0 < value < float("inf"):
-        raise OffbenchError(f"a budget must be positive, not {text!r}")
+        raise OffbenchError(f"a budget must be positive, not {budget!r}")
     return value

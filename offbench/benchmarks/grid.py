@@ -24,7 +24,7 @@ from pathlib import Path
 
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import JsonObject, read_errors, read_text
-from offbench.common.settings import build, short_repr
+from offbench.common.settings import build, setting, short_repr
 from offbench.common.text import MAX_INT, MAX_SEEDS
 from offbench.data import minari_store
 from offbench.data.levels import env_and_level, level_argument, parse_level, recipe_and_level
@@ -46,8 +46,8 @@ class GridDataset:
     id: str
     env: str = ""
     level: str = ""
-    steps: int | None = None
-    seed: int = 0
+    steps: int | None = setting(None, "transitions", low=1)
+    seed: int = setting(0, "seed of the recording", low=0, high=MAX_INT)
 
 
 @dataclass(frozen=True)
@@ -176,13 +176,17 @@ def _algorithm(
     entry = f"{where}: {value['name']}"
     changed = _schedule({key: item for key, item in value.items() if key in own}, schedule, entry)
     label = value.get("label", "")
-    if not isinstance(label, str) or len(label) > MAX_LABEL_LENGTH or not label.isprintable():
+    valid = (
+        isinstance(label, str) and len(label) <= MAX_LABEL_LENGTH and label.isprintable() and label == label.strip()
+    )
+    if not valid:
         raise OffbenchError(
-            f"{entry}: label must be a line of at most {MAX_LABEL_LENGTH} characters, not {short_repr(label)}"
+            f"{entry}: label must be a line of at most {MAX_LABEL_LENGTH} characters without spaces at its ends, "
+            f"not {short_repr(label)}"
         )
     patterns = value.get("datasets", ["*"])
     for pattern in _list(patterns, "datasets", entry):
-        if not isinstance(pattern, str) or not fnmatch.filter(ids, pattern):
+        if not isinstance(pattern, str) or not any(fnmatch.fnmatchcase(name, pattern) for name in ids):
             raise OffbenchError(
                 f"{entry}: no dataset of this grid matches {short_repr(pattern)}; there are {', '.join(ids)}"
             )

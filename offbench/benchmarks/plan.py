@@ -55,7 +55,7 @@ class Benchmark:
 
 
 def prepare(
-    grid: str,
+    grid: str | Path,
     *,
     env: str | Path | None = None,
     runs: str | Path = "runs",
@@ -75,7 +75,7 @@ def prepare(
     Raises:
         OffbenchError: anything wrong in it.
     """
-    read = load_grid(grid)
+    read = load_grid(str(grid))
     datasets = [dataset.id for dataset in read.datasets]
     env_spec = load_recipe(env).env_spec() if env is not None else None
     variants = [

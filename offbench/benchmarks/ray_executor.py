@@ -36,7 +36,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import write_bytes
 from offbench.common.processes import environment
 from offbench.data import minari_store
-from offbench.training.claim import by_common_step
+from offbench.training.claim import by_common_step, check_imported_code
 from offbench.training.jobs import JobProgress, raise_first, train_job
 from offbench.training.registry import register, user_algorithm
 from offbench.training.source_code import own_modules
@@ -98,17 +98,17 @@ class RayExecutor:
         """The cluster's processors."""
         return int(self.ray.cluster_resources().get("CPU", 1))
 
-    def record(self, datasets: Sequence[GridDataset], workers: int) -> None:
-        """Record datasets, a task each. Raises OffbenchError for the first that failed."""
+    def record(self, datasets: Sequence[GridDataset], workers: int, deadline: float | None = None) -> None:
+        """Record datasets, a task each, none after the deadline. Raises OffbenchError for the first that failed."""
         task = self.ray.remote(**self._options)(_record)
         with _driver(minari_store.root()) as driver:
-            results = self.ray.get([task.remote(dataset, driver, self.server) for dataset in datasets])
+            results = self.ray.get([task.remote(dataset, driver, self.server, deadline) for dataset in datasets])
         raise_first([line for _, lines in results for line in lines])
 
     def train(self, jobs: Sequence[Job], processes: int) -> list[str]:
         """Train jobs, slice by slice, wherever a processor is free; return what went wrong, a line each."""
         jobs = [replace(job, specs=tuple(replace(s, folder=s.folder.resolve()) for s in job.specs)) for job in jobs]
-        common = Path(os.path.commonpath([spec.folder for job in jobs for spec in job.specs]))
+        common = Path(os.path.commonpath([spec.folder.parent for job in jobs for spec in job.specs]))
         for name in {job.first.algorithm for job in jobs}:
             self._send_code(name)
         waiting, active, problems = list(range(len(jobs))), dict["ObjectRef", int](), list[str]()
@@ -208,8 +208,8 @@ def read_folder(folder: Path) -> Files:
 
 
 def write_folder(folder: Path, files: Files) -> None:
-    """Make a folder hold these files. Checkpoints are written first and old ones deleted last."""
-    for name in sorted(files, key=lambda name: not name.startswith("checkpoint-")):
+    """Make a folder hold these files. A run's checkpoints are written last, as its training does."""
+    for name in sorted(files, key=lambda name: name.startswith("checkpoint-")):
         write_bytes(folder / name, files[name])
     for name in set(read_folder(folder)) - set(files):
         (folder / name).unlink(missing_ok=True)
@@ -284,22 +284,27 @@ def _train(
     def report(step: int, note: str) -> None:
         server.report.remote(index, step, note)
 
-    return _task(lambda: _train_here(job, driver, server, report), job.title)
+    def train(local: Job) -> list[str]:
+        check_imported_code(local, but_algorithm=own is not None)
+        return _train_groups(local, report)
+
+    return _task(lambda: _train_here(job, driver, server, train), job.title)
 
 
-def _train_here(job: Job, driver: Driver, server: ActorHandle, report: Callable[[int, str], None]) -> list[str]:
+def _train_here(job: Job, driver: Driver, server: ActorHandle, train: Callable[[Job], list[str]]) -> list[str]:
+    """Train a job in the driver's folders where this node shares them, else in a folder of this task's own."""
     import ray
 
     if driver.shares_disk():
         with driver.folders():
-            return _train_groups(job, report)
+            return train(job)
     with _own_folder() as folder:
         for name in {spec.dataset for spec in job.specs}:
             write_folder(minari_store.path_of(name), ray.get(server.read.remote(str(driver.datasets / name))))
         own = tuple(replace(spec, folder=folder / str(i)) for i, spec in enumerate(job.specs))
         for spec, local in zip(job.specs, own, strict=True):
             write_folder(local.folder, ray.get(server.read.remote(str(spec.folder))))
-        lines = _train_groups(replace(job, specs=own), report)
+        lines = train(replace(job, specs=own))
         for spec, local in zip(job.specs, own, strict=True):
             ray.get(server.write.remote(str(spec.folder), read_folder(local.folder)))
         return lines
@@ -311,8 +316,12 @@ def _train_groups(job: Job, report: Callable[[int, str], None]) -> list[str]:
     return [line for group in groups for line in train_job(replace(job, specs=tuple(group)), report)]
 
 
-def _record(source: GridDataset, driver: Driver, server: ActorHandle) -> tuple[bool, list[str]]:
-    """A task: record a dataset."""
+def _record(
+    source: GridDataset, driver: Driver, server: ActorHandle, deadline: float | None
+) -> tuple[bool, list[str]]:
+    """A task: record a dataset, unless it has waited until after the deadline."""
+    if deadline is not None and time.time() > deadline:
+        return True, []
     return _task(lambda: _record_here(source, driver, server), source.id)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import operator
 import os
 import signal
 import sys
@@ -53,9 +54,13 @@ def default_workers(workers: int | None) -> int:
     """Return `workers`, or one per core if it is None. Raises OffbenchError below 1 or above MAX_WORKERS."""
     if workers is None:
         return min(cores(), MAX_WORKERS)
-    if not 1 <= workers <= MAX_WORKERS:
-        raise OffbenchError(f"workers must be from 1 to {MAX_WORKERS:,}, not {workers}")
-    return workers
+    try:
+        count = operator.index(workers)
+    except TypeError:
+        count = 0
+    if not 1 <= count <= MAX_WORKERS:
+        raise OffbenchError(f"workers must be a whole number from 1 to {MAX_WORKERS:,}, not {workers!r}")
+    return count
 
 
 def blocking_workers(workers: int) -> int:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from offbench.common import checkpoints
+from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError
 from offbench.common.provenance import training_platform
 from offbench.data.transitions import Transitions
@@ -70,6 +71,26 @@ def by_common_step(specs: Sequence[RunSpec]) -> list[list[RunSpec]]:
         groups.append([spec for spec in left if best is None or best in steps_of[spec.folder]])
         left = [spec for spec in left if spec not in groups[-1]]
     return groups
+
+
+def check_imported_code(job: Job, *, but_algorithm: bool = False) -> None:
+    """Check that this process has imported the code that a job's runs were claimed with.
+
+    Args:
+        but_algorithm: whether to check the environment's code only.
+
+    Raises:
+        OffbenchError: the algorithm's or the environment's code was edited between the claim and the import.
+    """
+    for spec in job.specs:
+        config = spec.run.config()
+        changed = "" if but_algorithm else describe_changes(config.code, code_of(spec.algorithm))
+        if config.env_spec and not changed:
+            changed = describe_changes(config.env_code, environment_code(config.env_spec))
+        if changed:
+            raise OffbenchError(
+                f"{spec.folder}: code was edited since this command began ({changed}); run the command again"
+            )
 
 
 def _check_environment(spec: RunSpec, data: Transitions) -> None:

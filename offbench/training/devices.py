@@ -51,7 +51,7 @@ def pick_machine(device: str, workers: int | None, stack: int | str, precision: 
     """
     if stack != "auto" and not (isinstance(stack, int) and stack >= 1):
         raise OffbenchError(f"stack must be auto or a whole number from 1, not {stack!r}")
-    device = pick_device(device)
+    device = pick_device(str(device))  # a torch.device too
     check_precision(precision, device)
     return Machine(device, default_workers(workers), stack)
 

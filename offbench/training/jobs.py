@@ -20,6 +20,7 @@ from offbench.common.interrupts import announce_stop
 from offbench.common.processes import start_worker, uninterrupted_start
 from offbench.common.progress import Progress
 from offbench.common.text import printable
+from offbench.training.claim import check_imported_code
 from offbench.training.datasets import load_datasets
 from offbench.training.devices import matmul_settings
 from offbench.training.failures import describe_failure
@@ -211,6 +212,7 @@ def _worker(job: Job, sender: Connection, parent: int) -> None:
     start_worker(parent)
     traces: list[str] = []
     try:
+        check_imported_code(job)
         lines = train_job(job, lambda step, note: sender.send((step, note)))
     except Exception as error:
         lines = [_problem(job, error, traces.append)]

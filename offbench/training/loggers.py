@@ -42,7 +42,8 @@ class LoggerOptions:
         """Raise OffbenchError if a package is missing, before anything is trained."""
         requested = {"tensorboard": self.tensorboard, "wandb": self.wandb is not None}
         for package, is_requested in requested.items():
-            if is_requested and importlib.util.find_spec(package) is None:
+            spec = importlib.util.find_spec(package)
+            if is_requested and (spec is None or spec.origin is None):  # no origin: a folder, such as W&B writes
                 raise OffbenchError(f"--{package} needs the package {package}: pip install 'offbench[{package}]'")
 
 

@@ -86,7 +86,11 @@ def load_algorithm(name: str) -> type[Algorithm]:
         if name not in own:
             raise unknown("algorithm", name, points)
         module, _, qualname = own[name].partition(":")
-        return _user_algorithms.setdefault(name, operator.attrgetter(qualname)(importlib.import_module(module)))
+        try:
+            cls = operator.attrgetter(qualname)(importlib.import_module(module))
+        except (ImportError, AttributeError):  # a command of a script that registered it, in another folder
+            raise unknown("algorithm", name, points) from None
+        return _user_algorithms.setdefault(name, cls)
     point, *others = points[name]
     if others:
         raise OffbenchError(f"two algorithms are named {name!r}: {point.value} and {others[0].value}; rename yours")
@@ -100,7 +104,7 @@ def load_algorithm(name: str) -> type[Algorithm]:
     return _check_algorithm(cls, f"algorithm {name!r} ({point.value})")
 
 
-def register(algorithm: str | type) -> str:
+def register(algorithm: str | Path | type) -> str:
     """Make a user's own algorithm known by name; return the name for folders, tables and `load_algorithm`.
 
     Args:
@@ -110,6 +114,8 @@ def register(algorithm: str | type) -> str:
     Raises:
         OffbenchError: no such file or class, no valid algorithm, or a name that another algorithm has.
     """
+    if isinstance(algorithm, Path):
+        algorithm = str(algorithm)
     if isinstance(algorithm, str) and not re.search(r"\.py(:|$)", algorithm):
         return algorithm
     cls = _from_file(algorithm) if isinstance(algorithm, str) else algorithm

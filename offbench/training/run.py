@@ -117,17 +117,15 @@ class Run:
             OffbenchError: as `check`.
         """
         self.check(config)
-        if self.config_path.exists() and self._mismatch(config):
-            self.clear()
-        if self.config_path.exists():
-            self._relabel(config.label)
-            return
-        with self.locked():
-            if not self.config_path.exists():
-                values = dataclasses.asdict(config)
-                write_json(self.config_path, {k: v for k, v in values.items() if k != "sessions" or v})
-                return
-        self.claim(config)  # another process was faster
+        if not self.config_path.exists() or self._mismatch(config):
+            with self.locked():
+                self.check(config)  # another process may have trained the run since
+                if self.config_path.exists() and self._mismatch(config):
+                    self._delete_contents()
+                if not self.config_path.exists():
+                    values = dataclasses.asdict(config)
+                    write_json(self.config_path, {k: v for k, v in values.items() if k != "sessions" or v})
+        self._relabel(config.label)
 
     def _relabel(self, label: str) -> None:
         """Record another label; an empty one changes nothing."""
@@ -171,15 +169,25 @@ class Run:
         changed = describe_changes(existing.env_code, config.env_code)
         return f"{self.folder} was evaluated in other code of its environment: {changed}" if changed else ""
 
-    def clear(self) -> None:
-        """Delete what the folder holds, if it holds a run, so that it is trained again; config.json goes last."""
+    def check_unlocked(self) -> None:
+        """Raise OffbenchError if another process trains the run."""
         if self.config_path.exists():
             with self.locked():
-                # newest checkpoint first: what a killed process leaves must not be taken for a finished run
-                early = [self.folder / "similarity.json", *sorted(self.folder.glob("checkpoint-*"), reverse=True)]
-                late = {*self.folder.iterdir()} - {*early, self.config_path, self.folder / ".lock"}
-                for path in (*early, *late, self.config_path):
-                    delete(path)
+                pass
+
+    def clear(self) -> None:
+        """Delete what the folder holds, if it holds a run, so that it is trained again."""
+        if self.config_path.exists():
+            with self.locked():
+                self._delete_contents()
+
+    def _delete_contents(self) -> None:
+        """Delete what the folder holds, with the lock held; config.json goes last."""
+        # newest checkpoint first: what a killed process leaves must not be taken for a finished run
+        early = [self.folder / "similarity.json", *sorted(self.folder.glob("checkpoint-*"), reverse=True)]
+        late = {*self.folder.iterdir()} - {*early, self.config_path, self.folder / ".lock"}
+        for path in (*early, *late, self.config_path):
+            delete(path)
 
     def begin(self, step: int, steps: int, platform: TrainingPlatform) -> None:
         """Record in config.json that the run trains from `step` to `steps`, and the platform if it has changed.
@@ -285,9 +293,9 @@ class Run:
             open(path, newline="", encoding="utf-8", opener=open_regular) as file,
         ):
             rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file, strict=True)]
-            steps = [row["step"] for row in rows if "step" in row]
+            steps = [row.get("step", -1.0) for row in rows]
             if not all(low < high for low, high in itertools.pairwise([-1.0, *steps, MAX_VALUE])):
-                raise ValueError("its steps are out of order or out of range")
+                raise ValueError("its steps are missing, out of order or out of range")
             return rows
 
 

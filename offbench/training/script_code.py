@@ -1,7 +1,8 @@
 """Hashes of an algorithm's class that was defined in a script, in a notebook or at a prompt (Python's `__main__`).
 
 What else a script does, such as how long it trains, may change between two runs of it. So the hashes are of the class,
-of what it uses of `__main__` (functions, classes, numbers and texts), and of files beside the script that it uses.
+of what it uses of `__main__` (functions, classes, numbers, texts, arrays and sets), and of files beside the script
+that it uses.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import types
 from collections.abc import Iterator
 from pathlib import Path
 
-from offbench.common.code_hash import MAIN, file_hash, imported_files, source_hash
+from offbench.common.code_hash import MAIN, PART_OF, file_hash, imported_files, source_hash
 from offbench.common.files import sha256
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None))
@@ -37,9 +38,21 @@ def script_code(classes: list[type]) -> dict[str, str]:
             waiting += _used_by_class(value) if isinstance(value, type) else _used_by_function(value)
         elif _is_plain(value):
             hashes[MAIN + name] = sha256(repr(value).encode())
+        elif content := _array_or_set_hash(value):
+            hashes[f"{MAIN}{name}{PART_OF}content"] = content
         elif file := _file_beside(value):
             for path in imported_files(file, file.parent, {}):
                 hashes[f"{MAIN}{path.relative_to(file.parent)}"] = file_hash(path)
+    return hashes
+
+
+def closure_code(cls: type) -> dict[str, str]:
+    """Return {name: hash} of the values that a class's methods read of the functions around it."""
+    hashes = {}
+    for _, method in _used_by_class(cls):
+        for name, value in closure_of(method) if isinstance(method, types.FunctionType) else ():
+            if content := sha256(repr(value).encode()) if _is_plain(value) else _array_or_set_hash(value):
+                hashes[name] = content
     return hashes
 
 
@@ -62,13 +75,21 @@ def _used_by_class(cls: type) -> Iterator[tuple[str, object]]:
 
 
 def _used_by_function(function: types.FunctionType) -> Iterator[tuple[str, object]]:
-    """Yield the globals that a function reads, and the functions in its closure (which it decorates)."""
+    """Yield the globals that a function reads, and what it reads of the functions around it."""
     for name in _global_names(function.__code__):
         if name in function.__globals__:
             yield name, function.__globals__[name]
-    for cell in function.__closure__ or ():
+    yield from closure_of(function)
+
+
+def closure_of(function: types.FunctionType) -> Iterator[tuple[str, object]]:
+    """Yield the variables of the functions around a function that it reads: functions (decorated ones), and values."""
+    code = function.__code__
+    for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
         if isinstance(content := cell.cell_contents, types.FunctionType):
             yield content.__code__.co_qualname, content
+        elif not isinstance(content, type):
+            yield f"{code.co_qualname}{PART_OF}{name}", content
 
 
 def _global_names(code: types.CodeType) -> Iterator[str]:
@@ -86,6 +107,19 @@ def _is_plain(value: object) -> bool:
     if isinstance(value, dict):
         return all(map(_is_plain, (*value.keys(), *value.values())))
     return all(map(_is_plain, value)) if isinstance(value, list | tuple) else isinstance(value, PLAIN)
+
+
+def _array_or_set_hash(value: object) -> str:
+    """Return the hash of an array's numbers or of a set's members, "" for anything else."""
+    import numpy as np  # here, because commands that load no algorithm do without NumPy and PyTorch
+    import torch
+
+    if isinstance(value, set | frozenset):
+        return sha256(repr(sorted(map(repr, value))).encode())
+    array = value.detach().cpu().to(torch.float64).numpy() if isinstance(value, torch.Tensor) else value
+    if not isinstance(array, np.ndarray) or array.dtype.hasobject:
+        return ""
+    return sha256(f"{array.dtype}{array.shape}".encode() + array.tobytes())
 
 
 def _hash(one: type | types.FunctionType) -> str:

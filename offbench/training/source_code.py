@@ -5,6 +5,7 @@ A hash leaves out comments, docstrings and blank lines, which do not affect trai
     algorithm of offbench             its file
     algorithm of a package            all files of the package, and the installed version
     algorithm in a user's own file    the file, and the files in its folder that it imports
+    class made by a function          also the values that its methods read of that function
     class of a script or notebook     the class, its Config, its bases, and what they use (see script_code.py)
 """
 
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from offbench.common.code_hash import file_hash, imported_files, module_code, package_versions
 from offbench.training.registry import load_algorithm, user_algorithm
-from offbench.training.script_code import script_code
+from offbench.training.script_code import closure_code, script_code
 
 if TYPE_CHECKING:
     from offbench.algorithm.interface import Algorithm
@@ -47,7 +48,7 @@ def _code_of(algorithm_class: type[Algorithm]) -> dict[str, str]:
         elif package == "offbench":
             hashes[file.name] = file_hash(file)
         else:
-            hashes |= module_code(cls.__module__)
+            hashes |= module_code(cls.__module__) | closure_code(cls)
     return dict(sorted(hashes.items()))
 
 

@@ -21,6 +21,7 @@ from offbench.common.settings import check, fields, setting, without_numpy
 from offbench.training.loggers import NO_LOGGERS, LoggerOptions
 from offbench.training.registry import load_algorithm, register
 from offbench.training.run import Run
+from offbench.training.source_code import code_of
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -130,7 +131,7 @@ class Job:
 
 
 def specs_of(
-    algorithm: str | type,
+    algorithm: str | Path | type,
     settings: Mapping[str, object],
     datasets: Sequence[str],
     schedule: TrainingSchedule,
@@ -152,6 +153,7 @@ def specs_of(
         OffbenchError: an unknown algorithm or setting, a bad value, or a label for several variants.
     """
     algorithm, variants = register(algorithm), []
+    code_of(algorithm)  # hashed as imported now: its files may change before the runs are claimed
     configs = configurations(load_algorithm(algorithm).Config, settings, algorithm)
     if label and len(configs) > 1:
         raise OffbenchError(

@@ -28,7 +28,7 @@ from offbench.training.stack import Stack
 
 
 def train(
-    algorithm: str | type[Algorithm],
+    algorithm: str | Path | type[Algorithm],
     dataset: str | Sequence[str],
     *,
     env: str | Path | None = None,
@@ -136,6 +136,8 @@ class Training:
         if fresh:
             for job in self._all_jobs:  # if the code fails, nothing is deleted
                 _try_update(job.first, self._datasets)
+            for spec in specs:  # nor if another process trains one of the runs
+                spec.run.check_unlocked()
             for spec in specs:
                 spec.run.clear()
         for job in self._all_jobs:
@@ -185,6 +187,7 @@ def _try_update(spec: RunSpec, datasets: Datasets) -> None:
 
 
 def _seed_list(seeds: int | Sequence[int]) -> tuple[int, ...]:
+    seeds = without_numpy(seeds)
     return tuple(map(check_seed, seeds if isinstance(seeds, Iterable) else [seeds]))
 
 

@@ -26,7 +26,7 @@ from offbench.common.seeds import Purpose
 from offbench.common.terminal import inform
 from offbench.data.transitions import Transitions
 from offbench.rollouts.rollouts import EpisodeStats, Rollouts, gather
-from offbench.training.claim import new_run_config
+from offbench.training.claim import by_common_step, new_run_config
 from offbench.training.loggers import Loggers
 from offbench.training.registry import load_algorithm
 from offbench.training.run import Run
@@ -82,6 +82,11 @@ class Trainer:
                 resources.enter_context(run.locked())
             for run, spec, data in zip(self.runs, self.job.specs, self.stack.data, strict=True):
                 run.check_claimed(new_run_config(spec, data, self.job.device, ""))
+            if by_common_step(self.job.specs) not in ([], [list(self.job.specs)]):
+                raise OffbenchError(
+                    f"{self.job.title}: another process has trained some of these runs since this command began; run "
+                    "it again"
+                )
             self._resume()
             for run in self.runs:
                 if self.stack.step:
@@ -154,7 +159,12 @@ class Trainer:
         return step % self.job.first.eval_every == 0 or step == self.job.first.steps
 
     def _resume(self) -> None:
-        """Load the newest step that all runs have an intact checkpoint of, and drop what came after it."""
+        """Load the newest step that all runs have an intact checkpoint of, and drop what came after it.
+
+        Raises:
+            OffbenchError: there is none, but some of several runs have intact checkpoints.
+        """
+        any_intact = False
         common = set.intersection(*(set(checkpoints.steps(run.folder)) for run in self.runs))
         for step in sorted((s for s in common if s <= self.job.first.steps), reverse=True):
             loaded = [checkpoints.load_checkpoint(run.folder, step) for run in self.runs]
@@ -164,6 +174,12 @@ class Trainer:
                     self.stack.captured_update.resume_logging(i, state.get("unlogged", []))
                 self.stack.step = step
                 break
+            any_intact = any_intact or any(loaded)
+        if any_intact and not self.stack.step:
+            raise OffbenchError(
+                f"{self.job.title}: the runs have intact checkpoints, but none of the same step; delete the runs "
+                "whose checkpoints are damaged (see above), and rerun the command"
+            )
         for i, run in enumerate(self.runs):
             if self.stack.step and not run.policy_path.exists():  # deleted by the user; the checkpoint has it
                 self.stack.policy(i).save(run.policy_path)

@@ -55,6 +55,19 @@ def test_runs_of_two_lengths_compare_at_the_shorter_one(capsys: pytest.CaptureFi
 
 
 @pytest.mark.usefixtures("home")
+def test_between_two_evaluations_a_run_is_as_at_the_first_of_them(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("td3_bc", "bc"):
+        for seed in (0, 1):
+            run(name, seed, LONG)
+    (row, _) = offbench.normalize(steps=25_000)
+    assert (row["steps"], row["of_steps"]) == (20_000, 20_000)
+    main(["compare", "td3_bc", "bc", "--steps", "25000"])
+    assert "did not reach" not in capsys.readouterr().out
+    with pytest.raises(OffbenchError, match="steps must be at least 1, not -5"):
+        offbench.normalize(steps=-5)
+
+
+@pytest.mark.usefixtures("home")
 def test_runs_evaluated_later_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
     run("td3_bc", 0, LONG)
     run("bc", 0, {5_000: 15.0, 10_000: 16.0})

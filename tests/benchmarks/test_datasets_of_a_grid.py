@@ -174,6 +174,8 @@ def test_a_table_may_leave_out_what_the_id_names(
         ),
         ('{id = "theirs-v2", steps = 500}', "theirs-v2 needs env"),
         ('"hopper-mediun-v0"', "unknown level 'mediun'"),
+        ('{id = "hopper-random-v0", steps = -1}', "steps must be at least 1, not -1"),
+        ('{id = "hopper-random-v0", seed = -1}', "seed must be at least 0, not -1"),
     ],
 )
 def test_an_id_that_contradicts_its_table_is_refused(dataset: str, message: str, home: Path) -> None:

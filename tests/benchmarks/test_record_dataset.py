@@ -120,7 +120,7 @@ def test_no_recording_begins_after_the_deadline(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(benchmark_module, "record_dataset", minute)
     monkeypatch.setattr(benchmark_module, "time", SimpleNamespace(time=lambda: clock[0]))
     sources = [GridDataset(f"{letter}-v0", "inverted-pendulum", "random") for letter in "abc"]
-    LocalExecutor(deadline=1100.0).record(sources, 1)
+    LocalExecutor().record(sources, 1, 1100.0)
     assert recorded == ["a-v0", "b-v0"]
     LocalExecutor().record(sources, 1)
     assert recorded == ["a-v0", "b-v0", "a-v0", "b-v0", "c-v0"]

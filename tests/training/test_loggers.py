@@ -125,6 +125,14 @@ def test_a_missing_package_is_said_first(package: str, medium: str, monkeypatch:
     assert not list(Path().glob("runs/**/config.json"))
 
 
+def test_the_folder_that_wandb_writes_is_not_the_package(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [str(home)])
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    (home / "wandb").mkdir()
+    with pytest.raises(offbench.OffbenchError, match="needs the package wandb"):
+        LoggerOptions(wandb="project").check()
+
+
 class FakeRun:
     """Stands for a run of W&B: it keeps what it is given."""
 

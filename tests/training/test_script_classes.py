@@ -136,6 +136,51 @@ def test_an_edited_cell_of_a_notebook_is_noticed(home: Path, medium: str, monkey
     train(CELL, steps=40)
 
 
+@pytest.mark.parametrize(
+    ("value", "other"),
+    [
+        ("torch.ones(2)", "torch.tensor([1.0, 2.0])"),
+        ("np.arange(3)", "np.arange(3.0)"),
+        ('{"a", "b"}', '{"a", "c"}'),
+    ],
+)
+def test_other_content_of_an_array_or_a_set_is_noticed(home: Path, value: str, other: str) -> None:
+    script = SCRIPT.replace("SCALE = 2.0", f"import numpy as np, torch\nSCALE = {value}").replace("limit = SCALE", "")
+    before, now = of_script(home, script), of_script(home, script.replace(value, other))
+    assert of_script(home, script) == before
+    assert describe_changes(before, now) == "__main__: SCALE: content has changed"
+    earlier = {name: text for name, text in before.items() if "content" not in name}
+    assert describe_changes(earlier, now) == ""
+
+
+FACTORY = """
+from offbench.algos.bc import BC
+
+def make(scale):
+    class Mine(BC):
+        def policy(self, run):
+            assert scale
+            return super().policy(run)
+    return Mine
+"""
+
+
+@pytest.mark.parametrize("module", ["__main__", "factory"])
+def test_classes_that_a_function_makes_with_other_values_are_told_apart(
+    home: Path, medium: str, module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (home / "factory.py").write_text(FACTORY)
+    source = types.ModuleType(module)
+    source.__file__ = str(home / "factory.py")
+    monkeypatch.setitem(sys.modules, module, source)
+    exec(compile(FACTORY, source.__file__, "exec"), vars(source))
+    small = {"hidden": (8,), "batch_size": 8, "eval_every": 10, "eval_episodes": 1, "workers": 1, "steps": 10}
+    offbench.train(source.make(1.0), medium, **small)
+    offbench.train(source.make(1.0), medium, **small | {"steps": 20})
+    with pytest.raises(OffbenchError, match=r"trained by other code of Mine: .*policy: scale has changed"):
+        offbench.train(source.make(2.0), medium, **small)
+
+
 def test_a_scripts_class_of_an_earlier_version_has_not_changed(home: Path) -> None:
     """Earlier versions hashed the class, its Config and its bases only."""
     now = of_script(home, SCRIPT)

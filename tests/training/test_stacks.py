@@ -15,9 +15,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import offbench
+from offbench.benchmarks.benchmark import benchmark
 from offbench.cli.main import main
 from offbench.common import checkpoints
 from offbench.common.errors import OffbenchError
+from offbench.training import registry
 from offbench.training.devices import pick_machine
 from offbench.training.jobs import run_jobs, train_job
 from offbench.training.registry import load_algorithm
@@ -204,6 +206,30 @@ def test_an_ensemble_of_numbers_is_checked_for_nan(medium: str) -> None:
     stack = Stack(load_algorithm("bdb"), stack_specs, load_datasets(stack_specs), "cpu")
     stack.tensors = lambda: {"actor.scale": torch.tensor([[1.0, 2.0], [3.0, float("nan")]])}  # type: ignore[method-assign]
     assert stack.diverged() == {1: "actor.scale"}
+
+
+def test_arguments_of_other_natural_types_are_taken(medium: str, home: Path) -> None:
+    (home / "mine.py").write_text("from offbench.algos.bc import BC\nclass Mine(BC): pass\n")
+    seeds: Any = np.array(3)
+    device: Any = torch.device("cpu")
+    times: dict[str, Any] = {"steps": 10, "eval_every": 10, "eval_episodes": 1, "workers": np.int64(1)}
+    (folder,) = offbench.train(home / "mine.py", medium, seeds=seeds, device=device, **times, **SMALL)
+    assert folder.name == "seed-3"
+    text = '["tiny-medium-v0"]\nsteps = 10\neval_episodes = 1\n[[algorithms]]\nname = "bc"\nhidden = [8]\n'
+    (home / "grid.toml").write_text(f"datasets = {text}")
+    assert benchmark(home / "grid.toml", budget=600, say=lambda line: None)
+    assert offbench.normalize(env="hopper", returns=1234.5) == offbench.normalize(env="hopper", returns=[1234.5])
+    many: Any = "many"
+    with pytest.raises(OffbenchError, match="workers must be a whole number from 1 to 1,000, not 'many'"):
+        offbench.train("bc", medium, workers=many)
+
+
+def test_an_algorithm_that_only_the_parent_process_can_import_is_unknown(
+    medium: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(registry.USER_ALGORITHMS_VARIABLE, '{"Mine": "gone_module:Mine"}')
+    with pytest.raises(OffbenchError, match="unknown algorithm 'Mine'"):
+        offbench.train("Mine", medium)
 
 
 def test_numpys_numbers_are_numbers(medium: str) -> None:
