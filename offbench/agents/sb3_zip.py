@@ -57,7 +57,7 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
     if kind == "gaussian" and settings.get("_last_original_obs") is not None:  # SAC and TD3 always set it
         raise OffbenchError(
             f"{path} was trained with VecNormalize, whose statistics are not in the zip; "
-            "give --policy module:function, a function that normalizes observations and then acts"
+            "give --policy module:function, a function that normalizes observations (unless norm_obs=False) and acts"
         )
     actions = len(layers[-1][1]) // (1 if kind == "tanh" else 2)
     low, high = _bounds(settings, "low", low, actions), _bounds(settings, "high", high, actions)

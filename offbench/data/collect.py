@@ -133,11 +133,13 @@ def _is_recorded(recording: Recording, dataset_id: str, level: str) -> bool:
     """
     if not minari_store.exists(dataset_id):
         return False
-    recorded = minari_store.read_provenance(minari_store.read_metadata(dataset_id))
+    metadata = minari_store.read_metadata(dataset_id)
+    recorded = minari_store.read_provenance(metadata)
     wanted = _metadata(recording, dataset_id, level)
     as_written = json.loads(json.dumps({minari_store.KEY: wanted[minari_store.KEY]}))
     new = minari_store.read_provenance(as_written)
     same = all(recorded.versions.get(name) == new.versions.get(name) for name in PHYSICS)
+    same = same and metadata.get("total_steps") == sum(recording.counts)  # Minari can add episodes
     same = same and all(getattr(recorded, key) == getattr(new, key) for key in IDENTITY)
     if same and (changed := describe_changes(recorded.env_code, new.env_code)):
         raise OffbenchError(

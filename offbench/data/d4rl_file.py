@@ -83,6 +83,9 @@ def _check(path: Path, columns: dict[str, h5py.Dataset]) -> None:
     rows = columns["observations"].shape[0] if columns["observations"].ndim == 2 else 0
     if not rows:
         raise OffbenchError(f"{path}: observations {columns['observations'].shape} are not rows of numbers")
+    for name in ("observations", "actions"):
+        if columns[name].dtype.kind in "biu":
+            raise OffbenchError(f"{path}: {name} are {columns[name].dtype}; convert them to float32 in the file")
     for name, column in columns.items():
         flat = column.shape in ((rows,), (rows, 1)) and name not in _WIDE
         wide = column.ndim == 2 and column.shape[0] == rows and column.shape[1] > 0 and name in _WIDE

@@ -111,12 +111,15 @@ def _columns(data: MinariDataset, dataset_id: str, progress: Progress, content: 
         for name in ("observations", "actions", "rewards"):
             finite(getattr(e, name), f"{dataset_id}, episode {e.index}: {name}")
         content.add(e.observations, e.actions, e.rewards, e.terminations, e.truncations)
+        terminals = flags(e.terminations, f"{dataset_id}, episode {e.index}: terminations")
+        timeouts = flags(e.truncations, f"{dataset_id}, episode {e.index}: truncations")
+        timeouts[-1] |= not terminals[-1]  # readers find an episode's end by its flags; Minari's buffers need none
         yield {
             "observations": e.observations[:-1],
             "actions": e.actions,
             "rewards": e.rewards,
-            "terminals": flags(e.terminations, f"{dataset_id}, episode {e.index}: terminations"),
-            "timeouts": flags(e.truncations, f"{dataset_id}, episode {e.index}: truncations"),
+            "terminals": terminals,
+            "timeouts": timeouts,
             "next_observations": e.observations[1:],
             **seeds(e.seed, len(e)),
         }
@@ -154,15 +157,31 @@ def _write_d4rl(path: Path, parts: Iterator[Columns], about: str) -> None:
         for rows in _blocks(parts):
             disk.check()
             for name, array in rows.items():
-                if name not in file:
-                    row = array.shape[1:]
-                    extents = {"shape": (0, *row), "maxshape": (None, *row), "chunks": (CHUNK, *row)}
-                    file.create_dataset(
-                        name, dtype=array.dtype, **extents, compression="gzip", compression_opts=4, shuffle=True
-                    )
-                column = file[name]
-                column.resize(len(column) + len(array), axis=0)
-                column[-len(array) :] = array
+                _append(_column_for(file, name, array), array)
+
+
+def _column_for(file: h5py.File, name: str, array: Array) -> h5py.Dataset:
+    """Return the column `name`, made or copied to a wider type so that it takes `array`.
+
+    The episodes of a Minari dataset may have different types, such as whole rewards in some of them.
+    """
+    earlier = file.get(name)
+    dtype = np.result_type(array.dtype, earlier.dtype) if earlier else array.dtype
+    if earlier and earlier.dtype == dtype:
+        return earlier
+    if earlier:
+        del file[name]  # `earlier` can still be read
+    row = array.shape[1:]
+    extents = {"shape": (0, *row), "maxshape": (None, *row), "chunks": (CHUNK, *row)}
+    column = file.create_dataset(name, dtype=dtype, **extents, compression="gzip", compression_opts=4, shuffle=True)
+    for first in range(0, len(earlier) if earlier else 0, CHUNK):
+        _append(column, earlier[first : first + CHUNK])
+    return column
+
+
+def _append(column: h5py.Dataset, array: Array) -> None:
+    column.resize(len(column) + len(array), axis=0)
+    column[-len(array) :] = array
 
 
 def _blocks(parts: Iterator[Columns]) -> Iterator[Columns]:

@@ -86,6 +86,15 @@ def check_id(dataset_id: str) -> str:
     return dataset_id
 
 
+def check_type(dataset_id: object) -> None:
+    """Raise OffbenchError if a user of the Python interface gives something other than the text of an id."""
+    if not isinstance(dataset_id, str):
+        raise OffbenchError(
+            "a dataset is named by its id, such as 'hopper-medium-v0' (`dataset.spec.dataset_id` in Minari), not by a "
+            f"{type(dataset_id).__name__}"
+        )
+
+
 def path_of(dataset_id: str) -> Path:
     """Return the folder of a dataset id, whether it exists or not."""
     return root() / check_id(dataset_id)
@@ -156,9 +165,9 @@ def read_metadata(dataset_id: str) -> JsonObject:
     Raises:
         OffbenchError: no such dataset (the nearest id is named), or its metadata is damaged.
     """
-    path = root() / dataset_id / "data" / "metadata.json"
     if not exists(dataset_id):
         raise _not_found_error(dataset_id)
+    path = root() / dataset_id / "data" / "metadata.json"
     remedy = "record or download the dataset again"
     metadata = read_json(path, remedy)
     check_metadata(metadata, path, remedy)
@@ -188,8 +197,8 @@ def _check_fields(metadata: JsonObject) -> None:
         if value is not None and not (isinstance(value, str) if key in TEXTS else number):
             raise ValueError(f"{key} is {str(value)[:40]!r}")
     for key in ("env_spec", "eval_env_spec"):
-        spec = json.loads(metadata.get(key) or "null")
-        if spec is not None and not (isinstance(spec, dict) and isinstance(spec.get("id"), str)):
+        spec = json.loads(text) if (text := metadata.get(key)) else {"id": ""}
+        if not (isinstance(spec, dict) and isinstance(spec.get("id"), str)):
             raise ValueError(f"{key} names no environment")
 
 
@@ -199,6 +208,7 @@ def exists(dataset_id: str) -> bool:
     Raises:
         OffbenchError: that is unknown.
     """
+    check_type(dataset_id)
     path = root() / dataset_id / "data" / "metadata.json"
     with read_errors(str(path), "cannot be looked up", "check the id and the disk"):
         return _inside(dataset_id) and (path.exists() or (_restore_replaced(root() / dataset_id) and path.exists()))
@@ -226,7 +236,7 @@ def check_content(dataset_id: str, metadata: JsonObject, content: str) -> None:
     if read_provenance(metadata).content_sha256 not in (None, content):
         raise OffbenchError(
             f"{dataset_id} is damaged: its arrays are not those of the content_sha256 in its metadata; "
-            "record or download it again"
+            "record it again with --overwrite, or download it again"
         )
 
 

@@ -18,7 +18,7 @@ from offbench.envs.physics import margins_matter
 from offbench.envs.recipes import load_recipe, shipped_recipes
 
 # a clause of a requirement: `>=3.1.0,<3.2.0` has two
-CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d{1,6})(?:\.(\d{1,6}))?")
+CLAUSE = re.compile(r"(==|~=|<=|>=|<|>)\s*(\d{1,6})(?:\.(\d{1,6})|(?!\.))")  # but not ==3.*
 
 
 def make_env(name: str | Path, render_mode: str | None = None) -> Env:

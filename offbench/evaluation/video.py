@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 ENDINGS = (".gif", ".mp4")
+CAMERA_ARGUMENTS = {"camera_id", "camera_name", "default_camera_config"}  # of Gymnasium's MuJoCo environments
 COLORS = 64  # colors of a GIF
 MAX_GIF_FPS = 50  # browsers show frames that take less than 0.02 s more slowly
 STREAM = (int(Purpose.REFERENCE), 3)  # other episodes than those of any measurement
@@ -144,8 +145,9 @@ def _renderable(env_spec: str, backend: str | None) -> Env:
         if backend is None:
             env.close()
             raise OffbenchError(NO_RENDERER)
-        # Gymnasium 1.4 renders from a fixed camera; the models have one that follows
-        if (camera := mujoco.mj_name2id(world.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")) >= 0:
+        # Gymnasium 1.4 renders from a fixed camera unless told otherwise; the models have one that follows
+        is_told = CAMERA_ARGUMENTS & json.loads(env_spec).get("kwargs", {}).keys()
+        if not is_told and (camera := mujoco.mj_name2id(world.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")) >= 0:
             world.mujoco_renderer.camera_id = camera
     return env
 

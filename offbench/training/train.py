@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from offbench.algorithm.interface import Algorithm
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import check_seed
 from offbench.common.settings import without_numpy
+from offbench.data.minari_store import check_type
 from offbench.envs.recipes import load_recipe
 from offbench.training.claim import check_folders, claim_unfinished
 from offbench.training.datasets import Datasets, check_datasets, load_datasets
@@ -80,7 +82,7 @@ def train(
         OffbenchError: anything that the user can fix, in one line.
     """
     schedule = TrainingSchedule(_seed_list(seeds), *map(without_numpy, (steps, eval_every, eval_episodes)))
-    names = [dataset] if isinstance(dataset, str) else list(dict.fromkeys(dataset))
+    names = _dataset_ids(dataset)
     env_spec = load_recipe(env).env_spec() if env is not None else None
     variants = specs_of(algorithm, settings, names, schedule, Path(runs), precision, env_spec)
     _check_schedule(schedule)
@@ -184,6 +186,14 @@ def _try_update(spec: RunSpec, datasets: Datasets) -> None:
     """Perform the first update of a run on the CPU, to check that its code works; discard the result."""
     stack = Stack(load_algorithm(spec.algorithm), [spec], {spec.dataset: datasets[spec.dataset]}, "cpu")
     stack.train(1)
+
+
+def _dataset_ids(dataset: object) -> list[Any]:
+    """Return the ids of one or several datasets, without duplicates. Raises OffbenchError for anything else."""
+    several = dataset if isinstance(dataset, Collection) and not isinstance(dataset, str) else [dataset]
+    for name in several:
+        check_type(name)
+    return list(dict.fromkeys(several))
 
 
 def _seed_list(seeds: int | Sequence[int]) -> tuple[int, ...]:

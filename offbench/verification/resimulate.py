@@ -202,6 +202,8 @@ def _one_step(env: Env, state: _StateSetter, e: RecordedEpisode, exact: bool, la
     seen = np.asarray(e.observations, np.float64)
     rounded = bool((seen == seen.astype(np.float32)).all())
     tolerance = ROUNDED if rounded else WHOLE if exact else CLOSE
+    is_float = np.issubdtype(e.rewards.dtype, np.floating)
+    reward_tolerance = max(tolerance, 4 * float(np.finfo(e.rewards.dtype).eps)) if is_float else tolerance
     last = len(e) - 1
     steps = np.unique(np.linspace(0, last, min(len(e), STEPS)).astype(int))
     complete = (np.abs(seen[:-1, state.positions : state.size]) != CLIPPED_VELOCITY).all(1)
@@ -214,7 +216,8 @@ def _one_step(env: Env, state: _StateSetter, e: RecordedEpisode, exact: bool, la
         state.set(seen[t])
         observation, reward, ended[i], _ = step(env, e.actions[t])
         state_off[i] = _state_differs(observation, seen[t + 1], state, tolerance)
-        reward_off[i] = abs(reward - float(e.rewards[t])) > tolerance * (1 + abs(reward))
+        expected = float(e.rewards.dtype.type(reward))
+        reward_off[i] = abs(expected - float(e.rewards[t])) > reward_tolerance * (1 + abs(reward))
     allowed = max(1, SHARE * len(steps)) if rounded else 0
     early = ended & (steps != last)
     state_off &= ~early  # what follows an end is another episode

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from minari.data_collector import EpisodeBuffer
 
 import offbench
 from offbench.agents.ladder import Ladder, folder_of
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.data import minari_store
+from offbench.data.minari_reader import open_minari
 from offbench.envs.recipes import load_recipe
 from offbench.tools.inventory import inventory, sections
 
@@ -147,6 +149,21 @@ def test_random_actions_need_no_agent(tiny: tuple[str, str], home: Path, monkeyp
     assert after["offbench"]["references"]["random"] == before["offbench"]["references"]["random"]
     assert np.isclose(after["ref_max_score"], after["offbench"]["references"]["expert"]["return"])
     assert metadata_of("mixed-v0")["offbench"]["content_sha256"] == before["offbench"]["content_sha256"]
+
+
+def test_a_dataset_that_minari_has_changed_does_not_count_as_recorded(tiny: tuple[str, str]) -> None:
+    offbench.collect(tiny[0], "random", steps=100, workers=1)
+    data = open_minari("tiny-random-v0")
+    (found,) = data.sample_episodes(1)
+    flags = {"terminations": found.terminations, "truncations": found.truncations}
+    arrays = {"observations": found.observations, "actions": found.actions, "rewards": found.rewards}
+    data.update_dataset_from_buffer([EpisodeBuffer(id=None, infos={}, **arrays, **flags)])
+    with pytest.raises(OffbenchError, match="record it again with --overwrite, or download it again"):
+        offbench.load("tiny-random-v0")
+    with pytest.raises(OffbenchError, match=r"exists already .* use --overwrite to replace it"):
+        offbench.collect(tiny[0], "random", steps=100, workers=1)
+    offbench.collect(tiny[0], "random", steps=100, overwrite=True, workers=1)
+    assert len(offbench.load("tiny-random-v0")) == 100
 
 
 def test_no_dataset_is_recorded_inside_another(home: Path, tiny: tuple[str, str]) -> None:

@@ -209,3 +209,49 @@ def test_an_empty_dataset_is_not_exported(home: Path) -> None:
     assert {finding.code for finding in verify("empty-v0", workers=1).findings} == {"empty"}
     with pytest.raises(OffbenchError, match="no episodes"):
         offbench.show("empty-v0")
+
+
+def test_an_export_of_episodes_of_several_types_keeps_every_number(home: Path) -> None:
+    """Whole rewards in the first 17,000 steps, more than one block, and fractions later."""
+    whole = episode(17_000, 0, False, rewards=np.zeros(17_000, np.int64))
+    whole["observations"] = whole["observations"].astype(np.float32)
+    fractions = episode(100, 0.1, True, rewards=np.full(100, 0.9))
+    name = foreign("mixed-v0", [whole, fractions, whole])
+    offbench.export(name, home / "mixed.hdf5")
+    with h5py.File(home / "mixed.hdf5") as file:
+        assert set(file) == {
+            "observations",
+            "actions",
+            "rewards",
+            "terminals",
+            "timeouts",
+            "next_observations",
+            "infos",
+        }
+        assert file["rewards"][:].tolist() == [0.0] * 17_000 + [0.9] * 100 + [0.0] * 17_000
+        np.testing.assert_array_equal(file["observations"][17_000:17_100], fractions["observations"][:-1])
+        np.testing.assert_array_equal(file["observations"][:17_000], whole["observations"][:-1])
+    offbench.import_d4rl(home / "mixed.hdf5", "back-v0")
+    for column in ("observations", "rewards", "returns", "ends"):
+        np.testing.assert_array_equal(getattr(offbench.load("back-v0"), column), getattr(offbench.load(name), column))
+
+
+def test_an_export_flags_the_ends_of_episodes_without_flags(home: Path) -> None:
+    unflagged = [episode(10, start, False, truncations=np.zeros(10, bool)) for start in (0, 100)]
+    name = foreign("unflagged-v0", [*unflagged, episode(5, 200, True)])
+    offbench.export(name, home / "out.hdf5")
+    offbench.export(name, home / "out.npz")
+    with h5py.File(home / "out.hdf5") as file, np.load(home / "out.npz") as arrays:
+        for columns in (file, arrays):
+            assert np.flatnonzero(columns["timeouts"][:]).tolist() == [9, 19]
+            assert np.flatnonzero(columns["terminals"][:]).tolist() == [24]
+
+
+@pytest.mark.parametrize("name", ["observations", "actions"])
+def test_whole_numbers_that_no_algorithm_takes_are_refused_at_once(
+    name: str, home: Path, rng: np.random.Generator
+) -> None:
+    columns = d4rl_file(home / "hopper_medium-v2.hdf5", [(60, "terminal")], 2, rng)
+    write(home / "hopper_medium-v2.hdf5", **columns | {name: columns[name].astype(np.int64)})
+    with pytest.raises(OffbenchError, match=f"{name} are int64; convert them to float32"):
+        import_d4rl(home / "hopper_medium-v2.hdf5", "whole-v0")

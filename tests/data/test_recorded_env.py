@@ -15,6 +15,7 @@ import pytest
 
 import offbench
 from offbench.common import seeds
+from offbench.common.errors import OffbenchError
 from offbench.common.seeds import Purpose
 from offbench.data import minari_store
 from offbench.data.recorded_env import recorded_margin
@@ -126,6 +127,8 @@ def test_where_no_version_is_recorded_verify_finds_the_margins(capsys: pytest.Ca
         ({"requirements": ["mujoco>=3.5,<5"]}, SUM_RULE),
         ({"requirements": ["mujoco-py>=4", "mujoco_py>=4"]}, None),
         ({"requirements": "mujoco==4.0.0"}, None),
+        ({"requirements": ["mujoco==3.*"]}, None),
+        ({"requirements": ["mujoco==3.4.*"]}, MAX_RULE),
         ({"offbench": {"versions": {}}}, MAX_RULE),
         ({"offbench": {"contact_margin": "sum", "versions": {"mujoco": "3.4.0"}}}, SUM_RULE),
         ({"offbench": {"contact_margin": None, "versions": {"mujoco": "4.0.0"}}}, MAX_RULE),
@@ -176,3 +179,12 @@ def test_making_an_environment_writes_no_log_and_prints_nothing(home: Path, capf
     assert not list(home.glob("MUJOCO_LOG*"))
     said = capfd.readouterr()
     assert not said.out + said.err
+
+
+@pytest.mark.parametrize("text", ["null", "[]", '{"id": 3}'])
+def test_a_spec_that_is_no_environment_is_damage(text: str, medium: str, home: Path) -> None:
+    path = home / "minari" / medium / "data" / "metadata.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"eval_env_spec": text}))
+    for call in (offbench.make_env, offbench.load, offbench.show):
+        with pytest.raises(OffbenchError, match=r"metadata\.json is damaged: eval_env_spec names no environment"):
+            call(medium)

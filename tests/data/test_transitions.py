@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,16 @@ def episode(steps: int, start: float, terminated: bool, **changes: Any) -> dict[
         "infos": {},
     }
     return values | changes
+
+
+@pytest.mark.parametrize(
+    "call", [offbench.load, offbench.show, offbench.verify, lambda name: offbench.train("bc", name)]
+)
+def test_a_dataset_is_named_by_its_id(call: Callable[[Any], object]) -> None:
+    name = foreign("named-v0", [episode(3, 0, True)])
+    for wrong in (minari.load_dataset(name), Path(name)):
+        with pytest.raises(OffbenchError, match="a dataset is named by its id, such as 'hopper-medium-v0'"):
+            call(wrong)
 
 
 def test_rows_point_at_each_transitions_observation() -> None:

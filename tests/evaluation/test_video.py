@@ -6,12 +6,14 @@ import os
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from offbench.common.errors import OffbenchError
+from offbench.envs.environments import env_spec
 from offbench.envs.recipes import recipes_folder
 from offbench.evaluation import renderer, video
 from tests.cli.test_bad_input import refusal
@@ -228,3 +230,12 @@ def test_mp4_without_its_encoder_names_the_extra(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(OffbenchError, match=r"offbench\[video\]"):
         video.video(POLICY, out="film.mp4")
+
+
+@pytest.mark.usefixtures("draws")
+def test_a_camera_that_the_environment_names_is_used() -> None:
+    """Hopper's model has one that follows, number 0; -1 is MuJoCo's free one."""
+    for chosen, camera in (({}, 0), ({"camera_id": -1}, -1)):
+        env: Any = video._renderable(env_spec("Hopper-v5", **chosen), renderer.working_backend())
+        assert env.unwrapped.mujoco_renderer.camera_id == camera
+        env.close()

@@ -171,3 +171,15 @@ def test_terminations_at_the_time_limit_alone_are_told_without_playing() -> None
     report = verify(name, workers=1, episodes=0)
     found = {finding.code: finding.what for finding in report.findings}
     assert "all 4 terminations lie exactly at the time limit of 20" in found["timeouts-as-terminations"]
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.0001])
+def test_rewards_in_float32_are_compared_in_float32(factor: float) -> None:
+    """As Stable-Baselines3's environments give them; without seeds, the steps are played one at a time."""
+    name = recorded("rewards-v0", "Hopper-v5", nothing, seeded=False)
+
+    def to_float32(file: h5py.File) -> None:
+        for group in each(file):
+            replace(group, "rewards", (factor * group["rewards"][:]).astype(np.float32))
+
+    assert codes(tamper(name, to_float32)) == (set() if factor == 1 else {"other-rewards"})
