@@ -11,6 +11,7 @@ import pytest
 import offbench
 from offbench.benchmarks import ray_executor
 from offbench.common import checkpoints
+from offbench.common.code_hash import file_hash
 from offbench.common.errors import OffbenchError
 from offbench.training.devices import pick_machine
 from offbench.training.jobs import run_jobs
@@ -58,11 +59,11 @@ def test_code_that_is_edited_before_a_job_starts_is_refused(home: Path, medium: 
 
 def test_the_hash_is_of_the_code_that_was_imported(home: Path, medium: str) -> None:
     edit(home, OWN)
+    imported = {"mine.py": file_hash(home / "mine.py")}
     runs = specs("./mine.py", medium, 20)
-    imported = code_of("Mine")
     (home / "mine.py").write_text(OWN.replace("1.0", "2.0"))
     training(runs)
-    assert runs[0].run.config().code == imported
+    assert imported.items() <= runs[0].run.config().code.items()
 
 
 def test_a_run_that_another_command_has_trained_further_is_left_alone(medium: str) -> None:
@@ -141,7 +142,7 @@ def test_a_run_without_intact_checkpoints_does_not_take_its_stack_back_to_the_st
 
 def test_an_upload_that_fails_half_way_leaves_a_run_that_resumes(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
     (run,) = train("td3_bc", medium, "runs", 100)
-    (longer,) = train("td3_bc", medium, "longer", 200)
+    (longer,) = train("td3_bc", medium, "longer", 300)
     write = ray_executor.write_bytes
 
     def full(path: Path, data: bytes) -> None:
@@ -153,7 +154,7 @@ def test_an_upload_that_fails_half_way_leaves_a_run_that_resumes(medium: str, mo
     monkeypatch.setattr(ray_executor, "write_bytes", full)
     with pytest.raises(OSError, match="no space"):
         ray_executor.write_folder(run.folder, files)
-    train("td3_bc", medium, "runs", 200)
+    train("td3_bc", medium, "runs", 300)
     assert run.evaluations_path.read_bytes() == longer.evaluations_path.read_bytes()
 
 
