@@ -68,7 +68,7 @@ def export(dataset_id: str, out: str | Path, *, style: str | None = None, drop_t
         temporary = Path(folder) / path.name
         with unchanged(dataset_id):
             _write(dataset_id, temporary, style, drop_timeouts)
-        with open(temporary, "rb") as file:
+        with open(temporary, "r+b") as file:  # Windows flushes only what is open for writing
             os.fsync(file.fileno())
         os.replace(temporary, path)
     return path

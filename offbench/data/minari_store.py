@@ -109,7 +109,7 @@ def local_ids(unreadable: Callable[[OSError], None] | None = None) -> list[str]:
     base, ids, seen = root(), list[str](), set[str]()
     for folder, folders, _ in os.walk(base, onerror=unreadable, followlinks=True):
         if os.path.isfile(os.path.join(folder, "data", "metadata.json")):
-            ids.append(os.path.relpath(folder, base))
+            ids.append(Path(folder).relative_to(base).as_posix())
             folders.clear()
         if (real := os.path.realpath(folder)) in seen:  # links can make a circle
             folders.clear()

@@ -70,7 +70,7 @@ def write(
                 )
             provenance = metadata[KEY] | {"content_sha256": content.hexdigest()}
             storage.update_metadata(metadata | {KEY: provenance})
-            with open(temporary / "data" / "metadata.json", "rb") as file:
+            with open(temporary / "data" / "metadata.json", "r+b") as file:
                 os.fsync(file.fileno())
             _write_namespaces(path)
             check_ownership(temporary)

@@ -19,7 +19,7 @@ from offbench.training.registry import load_algorithm
 from offbench.training.spec import RunSpec
 from tests.benchmarks.test_benchmark import GRID
 
-RATE = Rate(updates=1000.0, bytes_per_run=10**9)
+RATE = Rate(updates_per_second=1000.0, bytes_per_run=10**9)
 MISSING = '{id = "mine-v0", env = "inverted-pendulum", level = "random", steps = 10_000_000}'
 
 
