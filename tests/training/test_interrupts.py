@@ -58,8 +58,8 @@ def test_training_survives_kill_9(medium: str, home: Path) -> None:
 
 
 def interrupted(*sent: int) -> Callable[[Stack, int], Iterator[int]]:
-    """Return a `Stack.train` that sends signals to this process at step 300."""
-    train_on = Stack.train
+    """Return a `Stack.train_in_chunks` that sends signals to this process at step 300."""
+    train_on = Stack.train_in_chunks
 
     def until_300(stack: Stack, until: int) -> Iterator[int]:
         for step in train_on(stack, until):
@@ -80,7 +80,7 @@ def test_ctrl_c_sigterm_and_sighup_save_a_checkpoint_where_they_arrive(
     words += ["--workers", "1", "--hidden", "16,16", "--batch-size", "32"]
     capsys.readouterr()
     with monkeypatch.context() as patched:
-        patched.setattr(Stack, "train", interrupted(sent))
+        patched.setattr(Stack, "train_in_chunks", interrupted(sent))
         with pytest.raises(SystemExit) as stopped:
             main(words)
     run = Run(Path("runs") / whole.folder.relative_to("whole"))
@@ -102,7 +102,7 @@ def test_ctrl_c_after_fresh_says_how_to_keep_the_checkpoint(
     words = ["train", "bc", "--dataset", medium, "--steps", "600", "--eval-every", "600", "--eval-episodes", "2"]
     words += ["--workers", "1", "--hidden", "8", "--batch-size", "32"]
     with monkeypatch.context() as patched:
-        patched.setattr(Stack, "train", interrupted(signal.SIGINT))
+        patched.setattr(Stack, "train_in_chunks", interrupted(signal.SIGINT))
         with pytest.raises(SystemExit):
             main([*words, "--fresh"])
     assert "rerun the same command without --fresh to resume" in " ".join(capsys.readouterr().err.split())
@@ -115,7 +115,7 @@ def test_ctrl_c_after_fresh_says_how_to_keep_the_checkpoint(
 
 def test_nohup_ignores_sighup(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup starts its command
-    monkeypatch.setattr(Stack, "train", interrupted(signal.SIGHUP))
+    monkeypatch.setattr(Stack, "train_in_chunks", interrupted(signal.SIGHUP))
     words = ["train", "bc", "--dataset", medium, "--steps", "400", "--eval-every", "400", "--eval-episodes", "2"]
     main([*words, "--workers", "1", "--hidden", "8", "--batch-size", "32"])
     (run,) = find_runs(Path("runs"))
@@ -145,7 +145,7 @@ def test_a_closed_terminal(ignored: bool, status: int, medium: str, home: Path) 
 
 @pytest.mark.usefixtures("ctrl_c")
 def test_a_second_ctrl_c_does_not_wait_for_a_checkpoint(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Stack, "train", interrupted(signal.SIGINT, signal.SIGINT))
+    monkeypatch.setattr(Stack, "train_in_chunks", interrupted(signal.SIGINT, signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         train("td3_bc", medium, "runs", 600, eval_every=200)
     (run,) = find_runs(Path("runs"))
