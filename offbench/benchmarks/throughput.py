@@ -98,18 +98,18 @@ def random_data(env_spec: str, rows: int = ROWS) -> Transitions:
     observations, actions = spaces_of(make_env(env_spec), "the environment")
     rng = np.random.default_rng(0)
     return Transitions(
-        "random",
-        "",
-        rng.standard_normal((rows + 1, *observations.shape)).astype(np.float32),
-        np.arange(rows),
-        rng.uniform(-1, 1, (rows, *actions.shape)).astype(np.float32),
-        rng.standard_normal(rows).astype(np.float32),
-        np.ones(rows, np.float32),
-        np.array([rows]),
-        np.zeros(1),
-        actions.low,
-        actions.high,
-        {"env_spec": env_spec},
+        dataset_id="random",
+        content_sha256="",
+        observations=rng.standard_normal((rows + 1, *observations.shape)).astype(np.float32),
+        rows=np.arange(rows),
+        actions=rng.uniform(-1, 1, (rows, *actions.shape)).astype(np.float32),
+        rewards=rng.standard_normal(rows).astype(np.float32),
+        masks=np.ones(rows, np.float32),
+        ends=np.array([rows]),
+        returns=np.zeros(1),
+        low=actions.low,
+        high=actions.high,
+        metadata={"env_spec": env_spec},
     )
 
 

@@ -193,7 +193,7 @@ def iqm_curve_figure(results: Results, styles: Mapping[Method, LineStyle]) -> Fi
         curves = {e.task.name: e.drawn_curve() for e in results.of(method) if e.task.reference}
         steps = sorted(set.intersection(*(set(curve[0]) for curve in curves.values()))) if curves else []
         if steps and curves.keys() == tasks:
-            whole[method] = steps[:: -max(1, len(steps) // 40)][::-1], curves  # the last one is kept
+            whole[method] = _thinned(steps, 40), curves
     if not whole:
         return None
 
@@ -238,12 +238,17 @@ def _column(entry: Entry, column: str) -> tuple[list[int], Array] | None:
         {int(row["step"]): row[column] for row in t.losses if {"step", column} <= row.keys()} for t in entry.runs
     ]
     steps = sorted(set.intersection(*(set(run) for run in series)))
-    steps = steps[:: -max(1, len(steps) // 200)][::-1]  # the last one is kept
+    steps = _thinned(steps, 200)
     if not steps:
         return None
     values = np.array([[run[step] for step in steps] for run in series])
     # a diverging run may exceed what an axis can show
     return steps, np.where(np.abs(values) < MAX_VALUE, values, np.nan)
+
+
+def _thinned(steps: Sequence[int], most: int) -> list[int]:
+    """Return every n-th step up to the last one, less than twice `most` of them."""
+    return list(steps[:: -max(1, len(steps) // most)][::-1])
 
 
 def _band(axes: Axes, x: Sequence[float], points: Sequence[Estimate], style: LineStyle) -> None:
@@ -313,16 +318,22 @@ def _draw(
 
 def _rc_params(name: str) -> Any:
     """Return matplotlib's settings: a $ in a name is no formula, and the ids in an SVG are always the same."""
-    style = {"text.parse_math": False, "svg.fonttype": "none", "svg.hashsalt": name, "axes.labelcolor": TEXT_COLOR}
-    style |= {
+    return {
+        "text.parse_math": False,
+        "svg.fonttype": "none",
+        "svg.hashsalt": name,
         "text.color": TEXT_COLOR,
-        "axes.edgecolor": GRID,
+        "axes.labelcolor": TEXT_COLOR,
         "xtick.color": TEXT_COLOR,
         "ytick.color": TEXT_COLOR,
+        "axes.edgecolor": GRID,
+        "axes.grid": True,
+        "grid.color": GRID,
+        "grid.alpha": 0.25,
+        "grid.linewidth": 0.6,
         "font.size": 9,
+        "axes.titlesize": 10,
     }
-    grid = {"axes.grid": True, "grid.color": GRID, "grid.alpha": 0.25, "grid.linewidth": 0.6}
-    return style | grid | {"axes.titlesize": 10}
 
 
 def _legend(styles: Sequence[LineStyle], most: int = 32) -> tuple[list[Line2D], list[str]]:

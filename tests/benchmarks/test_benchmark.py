@@ -72,7 +72,9 @@ def plan_lines(bench: Benchmark, shard: tuple[int, int] = (0, 1)) -> list[str]:
 @pytest.fixture
 def unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let plans name costs at once instead of measuring them."""
-    monkeypatch.setattr("offbench.benchmarks.plan.measure", lambda *_: Rate(updates_per_second=1000.0, bytes_per_run=10**6))
+    monkeypatch.setattr(
+        "offbench.benchmarks.plan.measure", lambda *_: Rate(updates_per_second=1000.0, bytes_per_run=10**6)
+    )
     monkeypatch.setattr("offbench.benchmarks.plan.operations", lambda *_: 1e9)
 
 
