@@ -234,9 +234,7 @@ def loss_figure(
 
 def _column(entry: Entry, column: str) -> tuple[list[int], Array] | None:
     """Return (steps, values [runs, steps]) of the rows that all runs have; long series are thinned."""
-    series = [
-        {int(row["step"]): row[column] for row in t.losses if {"step", column} <= row.keys()} for t in entry.runs
-    ]
+    series = [{int(row["step"]): row[column] for row in t.losses if column in row} for t in entry.runs]
     steps = sorted(set.intersection(*(set(run) for run in series)))
     steps = _thinned(steps, 200)
     if not steps:

@@ -9,7 +9,6 @@ a run that diverges:     is marked and left out from there on; the other runs co
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
@@ -191,7 +190,7 @@ class Trainer:
                 for step, episodes in run.evaluations().items()
                 if step <= self.stack.step and self._evaluates_at(step)
             }
-            self.losses[i] = [row for row in run.losses() if row.get("step", math.inf) <= self.stack.step]
+            self.losses[i] = [row for row in run.losses() if row["step"] <= self.stack.step]
 
     def _checkpoint(self) -> None:
         """Write everything up to now."""

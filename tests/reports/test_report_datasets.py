@@ -72,6 +72,7 @@ def test_a_shipped_dataset_card_is_shown(home: Path, monkeypatch: pytest.MonkeyP
     }
     write_json(home / "package" / "datasets" / "hopper" / "card.json", card)
     (home / "package" / "datasets" / "hopper" / "card.png").write_bytes(b"\x89PNG")
+    (home / "package" / "datasets" / "hopper" / "recipe.toml").touch()
     made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
     made_run(home / "runs", "my-medium-v0", "td3_bc", "default", 0, 50)
     monkeypatch.setattr(importlib.resources, "files", lambda _: home / "package")
