@@ -127,9 +127,12 @@ def test_runs_that_a_lost_node_left_far_apart_resume_on_their_own(home: Path, me
         train_job(started, lambda *_: None)
     job = Job(specs("apart", 600), "cpu")
     begun: list[int] = []
+
+    def train(local: Job) -> list[str]:
+        return ray_executor._train_groups(local, lambda step, _: begun.append(step))
+
     with ray_executor._driver(home) as driver:
-        arguments = (driver, SimpleNamespace(), lambda step, _: begun.append(step))
-        assert ray_executor._train_here(job, *arguments) == []
+        assert ray_executor._train_here(job, driver, SimpleNamespace(), train) == []
     assert begun[0] == 400
     assert 100 in begun
     assert 0 not in begun
