@@ -36,7 +36,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import write_bytes
 from offbench.common.processes import environment
 from offbench.data import minari_store
-from offbench.training.claim import by_common_step, check_imported_code
+from offbench.training.claim import by_common_step, check_algorithm_code
 from offbench.training.jobs import JobProgress, raise_first, train_job
 from offbench.training.registry import register, user_algorithm
 from offbench.training.source_code import own_modules
@@ -285,7 +285,8 @@ def _train(
         server.report.remote(index, step, note)
 
     def train(local: Job) -> list[str]:
-        check_imported_code(local, but_algorithm=own is not None)
+        if own is None:  # else it is the code that the driver sent
+            check_algorithm_code(local)
         return _train_groups(local, report)
 
     return _task(lambda: _train_here(job, driver, server, train), job.title)

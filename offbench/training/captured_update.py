@@ -43,7 +43,7 @@ class CapturedUpdate:
         self._traces: dict[Hashable, Trace] = {}
         self._done: dict[Hashable, int] = {}  # updates of each phase
         self._count = 0  # updates in this session
-        self._has_reported = False  # an attribute that the updates change and no checkpoint keeps
+        self._has_reported = False  # whether an attribute that no checkpoint keeps was reported
         self.eager = not algorithm.capture  # whether every update runs without capture
         self._side_stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None  # type: ignore[no-untyped-call]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from offbench.common import checkpoints
 from offbench.common.code_hash import describe_changes
@@ -73,24 +73,28 @@ def by_common_step(specs: Sequence[RunSpec]) -> list[list[RunSpec]]:
     return groups
 
 
-def check_imported_code(job: Job, *, but_algorithm: bool = False) -> None:
-    """Check that this process has imported the code that a job's runs were claimed with.
-
-    Args:
-        but_algorithm: whether to check the environment's code only.
+def check_algorithm_code(job: Job) -> None:
+    """Check that this process has imported the algorithm's code that a job's runs were claimed with.
 
     Raises:
-        OffbenchError: the algorithm's or the environment's code was edited between the claim and the import.
+        OffbenchError: it was edited between the claim and the import.
     """
     for spec in job.specs:
-        config = spec.run.config()
-        changed = "" if but_algorithm else describe_changes(config.code, code_of(spec.algorithm))
-        if config.env_spec and not changed:
-            changed = describe_changes(config.env_code, environment_code(config.env_spec))
-        if changed:
-            raise OffbenchError(
-                f"{spec.folder}: code was edited since this command began ({changed}); run the command again"
-            )
+        _check_code(spec, spec.run.config().code, code_of(spec.algorithm))
+
+
+def check_environment_code(job: Job) -> None:
+    """As `check_algorithm_code`, for the code and the files of the environment."""
+    for spec in job.specs:
+        if (config := spec.run.config()).env_spec:
+            _check_code(spec, config.env_code, environment_code(config.env_spec))
+
+
+def _check_code(spec: RunSpec, claimed: Mapping[str, str], imported: Mapping[str, str]) -> None:
+    if changed := describe_changes(claimed, imported):
+        raise OffbenchError(
+            f"{spec.folder}: code was edited since this command began ({changed}); run the command again"
+        )
 
 
 def _check_environment(spec: RunSpec, data: Transitions) -> None:

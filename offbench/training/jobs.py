@@ -20,7 +20,7 @@ from offbench.common.interrupts import announce_stop
 from offbench.common.processes import start_worker, uninterrupted_start
 from offbench.common.progress import Progress
 from offbench.common.text import printable
-from offbench.training.claim import check_imported_code
+from offbench.training.claim import check_algorithm_code, check_environment_code
 from offbench.training.datasets import load_datasets
 from offbench.training.devices import matmul_settings
 from offbench.training.failures import describe_failure
@@ -37,6 +37,7 @@ def train_job(job: Job, on_progress: OnProgress) -> list[str]:
     Raises:
         OffbenchError: anything that the user can fix.
     """
+    check_environment_code(job)
     with matmul_settings(job.device, job.first.precision):
         return Trainer(job, load_datasets(job.specs)).train(on_progress)
 
@@ -212,7 +213,7 @@ def _worker(job: Job, sender: Connection, parent: int) -> None:
     start_worker(parent)
     traces: list[str] = []
     try:
-        check_imported_code(job)
+        check_algorithm_code(job)
         lines = train_job(job, lambda step, note: sender.send((step, note)))
     except Exception as error:
         lines = [_problem(job, error, traces.append)]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 
 import offbench
@@ -13,6 +15,7 @@ from offbench.benchmarks import ray_executor
 from offbench.common import checkpoints
 from offbench.common.code_hash import file_hash
 from offbench.common.errors import OffbenchError
+from offbench.envs.environments import env_spec
 from offbench.training.devices import pick_machine
 from offbench.training.jobs import run_jobs
 from offbench.training.run import Run
@@ -166,3 +169,14 @@ def test_jobs_in_processes_check_the_code_of_packages_too(medium: str) -> None:
     problems = run_jobs(waiting.jobs, 2)
     assert ["td3_bc.py has changed" in line for line in problems] == [True]
     assert offbench.normalize("runs")
+
+
+def test_a_model_that_is_edited_before_a_job_starts_is_refused(home: Path, medium: str) -> None:
+    """Each job reads it anew, also in the process that claimed the runs."""
+    model = home / "pendulum.xml"
+    model.write_bytes((Path(gym.envs.mujoco.__file__).parent / "assets" / "inverted_pendulum.xml").read_bytes())
+    own = env_spec("InvertedPendulum-v5", xml_file=str(model))
+    waiting = training([dataclasses.replace(spec, env_spec=own) for spec in specs("td3_bc", medium, 100)])
+    model.write_text(model.read_text().replace('gravity="0 0 -9.81"', 'gravity="0 0 -5"'))
+    with pytest.raises(OffbenchError, match=r"code was edited since this command began \(pendulum.xml has changed\)"):
+        waiting.run()
