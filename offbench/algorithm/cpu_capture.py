@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch._ops import OpOverload
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_map_only
 
@@ -35,6 +36,12 @@ _UNREPEATABLE = {
     torch.Tag.data_dependent_output,  # .item()
     torch.Tag.dynamic_output_shape,  # nonzero()
 }
+_READ_BY_PYTHON = {
+    "tolist",
+    "numpy",
+    "__array__",
+    "__dlpack__",
+}  # methods of Tensor below which no operation is called
 _CONSTANTS = ("zeros", "ones", "full", "zeros_like", "ones_like", "full_like", "scalar_tensor")
 _ACTIVE = threading.local()
 
@@ -128,15 +135,15 @@ def trace(update: Callable[[], object]) -> Trace:
         NotCapturableError: it was done, but cannot be replayed.
     """
     trace = Trace()
-    mode = _Tracer(trace)
+    tracer, reads = _Tracer(trace), _Reads()
     _ACTIVE.trace = trace
     try:
-        with mode:
+        with tracer, reads:
             update()
     finally:
         _ACTIVE.trace = None
-    if mode.problem:
-        raise NotCapturableError(mode.problem)
+    if problem := tracer.problem or reads.problem:
+        raise NotCapturableError(problem)
     trace.finish()
     return trace
 
@@ -148,7 +155,7 @@ def one_call() -> Iterator[Trace | None]:
     if trace is None:
         yield None
     else:
-        with _disable_current_modes():
+        with _disable_current_modes(), torch._C.DisableTorchFunction():
             yield trace
 
 
@@ -179,6 +186,19 @@ class _Tracer(TorchDispatchMode):  # type: ignore[no-untyped-call]
             constant = func.overloadpacket.__name__ in _CONSTANTS
             self.trace.add(func, (args, kwargs), result, call, constant=constant)
         return result
+
+
+class _Reads(TorchFunctionMode):
+    """Notices that numbers are read into Python without an operation."""
+
+    problem = ""
+
+    def __torch_function__(
+        self, func: Callable[..., object], types: object, args: Args = (), kwargs: Kwargs | None = None
+    ) -> object:
+        if (name := getattr(func, "__name__", "")) in _READ_BY_PYTHON:
+            self.problem = self.problem or f"it calls Tensor.{name}"
+        return func(*args, **(kwargs or {}))
 
 
 def attributes(owner: object, *, in_place: bool = False) -> dict[str, object]:
@@ -307,6 +327,8 @@ def _agrees(variant: Variant, args: Args, kwargs: Kwargs, outputs: Sequence[Tens
     """Return whether a variant writes the same bits as the operation gave."""
     function, names = variant
     trial = [torch.empty_like(output) for output in outputs]
+    # some operations also change an input, for example the running means of batch normalization
+    args, kwargs = tree_map_only(Tensor, torch.clone, (args, kwargs))
     try:
         function(*args, **kwargs, **dict(zip(names, trial, strict=True)))
     except (TypeError, RuntimeError, NotImplementedError):

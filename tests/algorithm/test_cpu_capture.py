@@ -6,6 +6,7 @@ import itertools
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -104,6 +105,30 @@ class ReadsNumbers(Plain):
         return loss * (2.0 if float(loss[0].detach()) > 0.5 else 1.0)
 
 
+class ReadsByNumPy(Plain):
+    def loss(self, error: Tensor) -> Tensor:
+        loss = super().loss(error)
+        return loss * (2.0 if np.asarray(loss.detach())[0] > 0.5 else 1.0)
+
+
+class ReadsAList(Plain):
+    def loss(self, error: Tensor) -> Tensor:
+        loss = super().loss(error)
+        return loss * (2.0 if loss.detach().tolist()[0] > 0.5 else 1.0)
+
+
+class WritesByNumPy(Plain):
+    """A running mean that NumPy updates in place."""
+
+    def setup(self, c: Config) -> None:
+        super().setup(c)
+        self.mean = torch.ones(len(self.run_seeds))
+
+    def loss(self, error: Tensor) -> Tensor:
+        self.mean.numpy()[:] *= 0.9
+        return super().loss(error) / self.mean
+
+
 class Counts(Plain):
     def loss(self, error: Tensor) -> Tensor:
         self.updates += 1
@@ -198,7 +223,18 @@ class ChangesInPlace(Plain):
         return loss / self.mean
 
 
-EAGER = [Random, ReadsNumbers, Counts, EveryFifth, EveryFifthByAttribute, GrowsAList, ChangesAListInADict]
+EAGER = [
+    Random,
+    ReadsNumbers,
+    ReadsByNumPy,
+    ReadsAList,
+    WritesByNumPy,
+    Counts,
+    EveryFifth,
+    EveryFifthByAttribute,
+    GrowsAList,
+    ChangesAListInADict,
+]
 EAGER += [ChangesConfig, ReplacesATensor, CountsInAPhase]
 
 
@@ -266,3 +302,19 @@ def test_a_record_is_done_as_well() -> None:
     assert first.same_as(again)
     with pytest.raises(NotCapturableError, match=r"draws random numbers by aten\.rand.*resumed run.*noise_spec"):
         trace(lambda: torch.rand(3))
+
+
+def test_recording_changes_running_means_once() -> None:
+    """PyTorch's schema of batch normalization does not say that it changes them."""
+    means = [torch.zeros(3), torch.zeros(3)]
+    batch = torch.randn(8, 3)
+
+    def update(mean: Tensor) -> None:
+        torch.nn.functional.batch_norm(batch, mean, torch.ones(3), training=True)
+
+    recorded = trace(lambda: update(means[0]))
+    update(means[1])
+    assert torch.equal(*means)
+    recorded.replay()
+    update(means[1])
+    assert torch.equal(*means)
