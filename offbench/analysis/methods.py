@@ -128,7 +128,7 @@ def find_method(methods: Sequence[Method], name: str) -> Method:
     Raises:
         OffbenchError: no such method here, or the algorithm has several variants.
     """
-    name = without_steps(name)
+    name = without_steps(str(name))
     for matches in ([m for m in methods if m.label == name], [m for m in methods if name in m.spellings]):
         if len(matches) == 1:
             return matches[0]
@@ -161,6 +161,13 @@ def rank(name: str, order: Sequence[str]) -> tuple[int, str]:
     return (order.index(name) if name in order else len(order), name)
 
 
-def method_order(method: Method) -> tuple[tuple[int, str], str, int, str]:
+def method_order(method: Method) -> tuple[object, ...]:
     """Return the sort key for the order of the paper's table: numeric betas in order, then names (adaptive)."""
-    return rank(method.algorithm, METHOD_ORDER), method.beta or "", len(method.variant), method.variant
+    is_default = method.variant == "default"
+    return rank(method.algorithm, METHOD_ORDER), _natural(method.beta or ""), not is_default, _natural(method.variant)
+
+
+def _natural(text: str) -> tuple[list[str | float], str]:
+    """Return a sort key that puts `hidden=64` before `hidden=256`."""
+    parts = re.split(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)", text)
+    return [float(part) if i % 2 else part for i, part in enumerate(parts)], text

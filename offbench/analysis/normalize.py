@@ -17,7 +17,7 @@ from offbench.analysis.methods import Method, unnamed_settings
 from offbench.analysis.results import SHORT_HASH, Entry, differing_settings_notes, entries_of, mixed_code, read_results
 from offbench.analysis.statistics import iqm
 from offbench.common import scores
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import JsonObject, csv_bytes
 from offbench.common.tables import latex, markdown, plain, tabular
 from offbench.common.text import aligned, compact, no_formula, printable
@@ -112,6 +112,7 @@ def score_returns(env: str | Path, returns: Sequence[float]) -> list[Row]:
         OffbenchError: unknown environment, a return that is not finite, or no reference at all.
     """
     recipe = load_recipe(env)
+    returns = list(map(float, returns))  # NumPy's numbers are not JSON
     if not all(abs(value) < scores.MAX_VALUE for value in returns):
         raise OffbenchError(f"returns must be finite numbers below {scores.MAX_VALUE:g}, not {list(returns)}")
     ladder = shipped_ladder(recipe) or read_ladder(folder_of(recipe, 0, BEHAVIOUR) / "ladder")
@@ -152,8 +153,9 @@ def normalize(
         if returns:
             raise OffbenchError("returns need their environment: give --env, e.g. --env hopper 1234.5")
         return score_runs(runs, steps)
-    if steps is not None:
-        raise OffbenchError("--steps has no effect with --env; leave it out")
+    for flag, given in (("steps", steps is not None), ("runs", str(runs) != "runs")):
+        if given:
+            raise OffbenchError(f"--{flag} has no effect with --env; leave it out")
     if not returns:
         raise OffbenchError(f"give the returns to normalize, e.g. --env {env} 1234.5 987")
     return score_returns(env, returns)
@@ -179,9 +181,17 @@ NAMES = ("dataset", "content", "method", "environment")  # columns of text
 
 
 def render(rows: Sequence[Row], style: str = "table") -> str:
-    """Return rows as text: an aligned table, JSON, CSV, Markdown or LaTeX."""
+    """Return rows as text: an aligned table, JSON, CSV, Markdown or LaTeX.
+
+    Raises:
+        OffbenchError: there is no such style.
+    """
+    if style not in FORMATS:
+        raise unknown("format", style, FORMATS)
     if style == "json":
         return json.dumps(list(rows), indent=1)
+    if not rows:
+        return ""
     if style == "csv":
         values = ([no_formula(value) for value in row.values()] for row in rows)
         return csv_bytes(list(rows[0]), values).decode().rstrip("\n")

@@ -24,6 +24,7 @@ from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError, unknown
 from offbench.common.files import READ_REMEDIES
 from offbench.common.scores import SCORED_EVALUATIONS, mean_std
+from offbench.common.settings import check_count
 from offbench.common.terminal import warn
 from offbench.data.levels import LEVELS, env_and_level
 from offbench.envs.environments import same_environment
@@ -177,7 +178,7 @@ Folders = str | Path | Sequence[str | Path]
 
 
 def read_results(
-    runs: Folders, *, steps: int | None = None, datasets: Sequence[str] = (), methods: Sequence[str] = ()
+    runs: Folders, *, steps: int | None = None, datasets: str | Sequence[str] = (), methods: str | Sequence[str] = ()
 ) -> Results:
     """Read every run below one or more folders.
 
@@ -190,10 +191,10 @@ def read_results(
         OffbenchError: none is evaluated, one is duplicated, or there is no such dataset or method. Damaged runs are
             named on stderr and left out.
     """
-    if steps is not None and steps < 1:
-        raise OffbenchError(f"steps must be at least 1, not {steps}")
+    steps = None if steps is None else check_count("steps", steps)
     roots = tuple(map(Path, [runs] if isinstance(runs, str | Path) else runs))
     unique = {run.folder.resolve(): run for root in roots for run in find_runs(root)}
+    datasets, methods = ([one] if isinstance(one, str) else one for one in (datasets, methods))
     entries, unevaluated = entries_of(unique.values(), datasets, steps=steps)
     if not entries:
         below = ", ".join(map(str, roots))

@@ -31,6 +31,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(formatter_class=_Formatter, **kwargs)
         self._positionals.title = "arguments"
         self.color = False  # Python 3.14 would color the help, too
+        self._negative_number_matcher = re.compile(r"-\.?\d[\d_.]*(e[+-]?\d+)?$", re.IGNORECASE)  # also -1e3
 
     def error(self, message: str) -> NoReturn:
         """Raise the error that `main` prints."""

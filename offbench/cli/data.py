@@ -107,13 +107,15 @@ def list_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `list`."""
     what = ("environments", "levels", "algorithms", "datasets", "runs")
     parser.add_argument("what", nargs="?", choices=what, metavar="WHAT", help=f"only these: {', '.join(what)}")
-    parser.add_argument("--runs", default="runs", metavar="DIR", help="folder of the runs (default: runs)")
+    parser.add_argument("--runs", metavar="DIR", help="with `list runs`: their folder (default: runs)")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
-    def run(what: str | None, runs: str, json: bool) -> None:
+    def run(what: str | None, runs: str | None, json: bool) -> None:
         from offbench.tools.inventory import sections
 
-        contents = offbench.inventory(what, runs=runs)
+        if runs is not None and what != "runs":
+            parser.error("--runs has an effect only in `offbench list runs`")
+        contents = offbench.inventory(what, runs=runs or "runs")
         if json:
             print(dumps(contents, indent=1))
             return
@@ -162,6 +164,8 @@ def card_arguments(parser: Parser, _: list[str]) -> None:
 
     def run(about: str, huggingface: bool, out: str | None, behaviour_dir: str) -> None:
         if huggingface:
+            if behaviour_dir != parser.get_default("behaviour_dir"):
+                parser.error("--behaviour-dir has no effect with --huggingface")
             print(f"saved {offbench.huggingface_card(about, out)}")
         elif about in local_datasets():
             parser.error(f"{about} is a dataset: give --huggingface, or an environment")

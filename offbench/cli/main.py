@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -139,6 +140,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     if {"_ARGCOMPLETE", "COMP_LINE", "COMP_POINT"} <= os.environ.keys():  # a shell asks for completions
         _complete()
     _open_closed()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: terminals whose encoding lacks a ±
     os.environ["MPLBACKEND"] = "Agg"  # figures are files; matplotlib does not import with a name that it does not have
     try:
         with contextlib.redirect_stderr(_IgnoreWriteErrors(sys.stderr)):
@@ -157,11 +160,15 @@ def _main(words: list[str]) -> None:
         print(file=sys.stderr)
         labeled("offbench", f"stopped{resume if _command(words) in RESUMABLE else ''}", "bold yellow")
         sys.exit(128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT))
-    except BrokenPipeError:  # the reader of a pipe (`| head`) has left
+    except _ReaderLeftError:
         sys.exit(0)
     except Exception as error:
         labeled("offbench", " ".join(describe_failure(error).split()), "bold red")
         sys.exit(2)
+
+
+class _ReaderLeftError(BrokenPipeError):
+    """The program that reads our output from a pipe (`| head`) has ended."""
 
 
 class _Stream:
@@ -183,12 +190,11 @@ class _Printable(_Stream):
         return self._stream
 
     def write(self, text: str) -> int:
-        encoding = self._stream.encoding or "utf-8"
-        with write_errors("the output"):
-            return self._stream.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
+        with _reader_left(), write_errors("the output"):
+            return self._stream.write(printable(text))
 
     def flush(self) -> None:
-        with write_errors("the output"):
+        with _reader_left(), write_errors("the output"):
             self._stream.flush()
 
 
@@ -207,12 +213,20 @@ class _IgnoreWriteErrors(_Stream):
 
 @contextlib.contextmanager
 def _ignored_write_errors() -> Iterator[None]:
+    with _reader_left():
+        try:
+            yield
+        except OSError as error:
+            if isinstance(error, BrokenPipeError):
+                raise
+
+
+@contextlib.contextmanager
+def _reader_left() -> Iterator[None]:
     try:
         yield
-    except BrokenPipeError:
-        raise
-    except OSError:
-        pass
+    except BrokenPipeError as error:
+        raise _ReaderLeftError from error
 
 
 @contextlib.contextmanager

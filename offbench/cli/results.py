@@ -53,6 +53,8 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
     def run(style: str, plot: str | None, **arguments: Any) -> None:
         from offbench.analysis.normalize import without_evaluation
 
+        if plot and arguments["env"]:
+            raise OffbenchError("--plot has no effect with --env; leave it out")
         print_scores(offbench.normalize(**arguments), style)
         waiting, diverged = (0, 0) if arguments["env"] else without_evaluation(arguments["runs"], arguments["steps"])
         if waiting:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from offbench.common.errors import OffbenchError
 from offbench.common.files import output_file, write_bytes
@@ -14,6 +15,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMATS = ("png", "svg", "pdf")
+
+
+def default_style(settings: Any = None) -> AbstractContextManager[None]:
+    """Return a context with matplotlib's default style, not the user's, and some settings of matplotlibrc."""
+    from matplotlib.style import context
+
+    return context(["default", settings or {}])
 
 
 def figure(panels: int = 1) -> tuple[Figure, list[Axes]]:

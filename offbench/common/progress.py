@@ -83,7 +83,10 @@ class Progress:
 
     def _update(self, bar: Bar) -> None:
         self._last = time.monotonic()
-        bar.update(self._task, completed=self.done, details=self._details(bar), note=self._note, refresh=True)
+        details = self._details(bar)
+        room = max(bar.console.width - len(details) - NARROWEST_BAR, 4)
+        title = self.what if len(self.what) <= room else f"{self.what[: room - 3]}..."
+        bar.update(self._task, description=title, completed=self.done, details=details, note=self._note, refresh=True)
 
     def _rate(self) -> float:
         return (self.done - self._first) / max(time.monotonic() - self._began, 1e-9)

@@ -42,7 +42,7 @@ def check_seed(seed: object) -> int:
         OffbenchError: it is not a whole number from 0 to MAX_INT.
     """
     try:
-        number = operator.index(seed)  # type: ignore[arg-type]
+        number = -1 if isinstance(seed, bool) else operator.index(seed)  # type: ignore[arg-type]
     except TypeError:
         number = -1
     if not 0 <= number <= MAX_INT:

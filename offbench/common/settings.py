@@ -168,6 +168,14 @@ def without_numpy(value: object) -> Any:
     return value.tolist() if numpy and isinstance(value, numpy.generic | numpy.ndarray) else value
 
 
+def check_count(name: str, value: object) -> int:
+    """Return a whole number from 1 that a user of the Python interface gave. Raises OffbenchError for other values."""
+    value = without_numpy(value)
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise OffbenchError(f"{name} must be a whole number from 1, not {short_repr(value)}")
+    return value
+
+
 def short_repr(value: object) -> str:
     """Return the repr of a value, shortened for an error message."""
     try:

@@ -76,6 +76,9 @@ def printable(text: str) -> str:
     return _CONTROLS.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
 
 
+_NUMBERS = re.compile(r"[+-]?[\d.,]+(e[+-]?\d+)?(( ± | to )-?[\d.,]+)?( \([\w,. ]+\))?|-inf")
+
+
 def no_formula(cell: object) -> object:
     """Return a CSV cell that no spreadsheet takes for a formula: such text gets an apostrophe in front.
 
@@ -86,8 +89,4 @@ def no_formula(cell: object) -> object:
     cell = printable(cell)
     if not (cell[1:] and (cell[0] == "\t" or cell.lstrip()[:1] in tuple("=+-@"))):
         return cell
-    try:
-        float(cell)
-    except ValueError:
-        return f"'{cell}"
-    return cell
+    return cell if _NUMBERS.fullmatch(cell) else f"'{cell}"

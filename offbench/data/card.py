@@ -20,6 +20,7 @@ import numpy as np
 from offbench.agents.ladder import BEHAVIOUR, Ladder, find_ladder
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, read_json, write_bytes, write_json
+from offbench.common.plotting import default_style, figure, save
 from offbench.common.provenance import PHYSICS, versions
 from offbench.common.scores import normalize
 from offbench.common.tables import markdown
@@ -66,7 +67,8 @@ def card(env: str | Path, out: str | Path | None = None, behaviour_dir: str | Pa
     used = {name: versions()[name] for name in PHYSICS}
     _add_shipped_hashes(recipe, facts, used["mujoco"])
     write_json(folder / "card.json", {"format": "offbench-card-2", "versions": used, "levels": facts})
-    _draw(recipe, ladder, levels, folder / "card.png")
+    with default_style():
+        _draw(recipe, ladder, levels, folder / "card.png")
     write_bytes(folder / "README.md", _text(env, recipe, ladder, facts, used).encode())
     return folder
 
@@ -241,8 +243,6 @@ def _short(value: float | None) -> str:
 
 
 def _draw(recipe: Recipe, ladder: Ladder, levels: Mapping[str, Summary], path: Path) -> None:
-    from offbench.common.plotting import figure, save
-
     with open(ladder.folder / "ladder.csv", newline="", encoding="utf-8") as file:
         rows = [{key: row[key] for key in ("step", "return", "deterministic_return")} for row in csv.DictReader(file)]
     steps = [int(row["step"]) for row in rows]

@@ -14,6 +14,7 @@ from offbench.common.processes import default_workers
 from offbench.common.progress import Progress
 from offbench.common.provenance import PHYSICS, versions
 from offbench.common.seeds import check_seed
+from offbench.common.settings import check_count
 from offbench.common.terminal import inform
 from offbench.data import minari_store, minari_writer
 from offbench.data.behaviour_policy import level_name
@@ -89,8 +90,7 @@ def collect(
         name = level = level_name(name, str(policy))
         policy_source, parts = str(policy), (Part(POLICY),)
     dataset_id = minari_store.check_id(dataset_id or f"{recipe.name}-{name}-v{recipe.version}")
-    if steps is not None and steps < 1:
-        raise OffbenchError(f"steps must be at least 1, not {steps}")
+    steps = None if steps is None else check_count("steps", steps)
     workers = default_workers(workers)
 
     def recording_with(ladder: Ladder | None) -> Recording:

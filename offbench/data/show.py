@@ -11,6 +11,7 @@ import numpy as np
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
+from offbench.common.plotting import default_style, figure, picture_file, save
 from offbench.common.scores import normalize
 from offbench.common.settings import short_repr
 from offbench.data import minari_store, transitions
@@ -64,15 +65,14 @@ class Summary:
 
     def plot(self, path: str | Path) -> Path:
         """Draw the histogram of returns. Raises OffbenchError if the figure cannot be written."""
-        from offbench.common.plotting import figure, picture_file, save
-
         path = picture_file(path)
-        fig, (axes,) = figure()
-        axes.hist(self.returns, bins=40, color="#3b6ea5")
-        axes.axvline(self.returns.mean(), color="#c44", linewidth=1.2, label=f"mean {self.returns.mean():.0f}")
-        axes.set(xlabel="return", ylabel="episodes", title=self.dataset_id)
-        axes.legend(frameon=False)
-        return save(fig, path)
+        with default_style():
+            fig, (axes,) = figure()
+            axes.hist(self.returns, bins=40, color="#3b6ea5")
+            axes.axvline(self.returns.mean(), color="#c44", linewidth=1.2, label=f"mean {self.returns.mean():.0f}")
+            axes.set(xlabel="return", ylabel="episodes", title=self.dataset_id)
+            axes.legend(frameon=False)
+            return save(fig, path)
 
 
 def show(dataset_id: str) -> Summary:

@@ -15,6 +15,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.processes import blocking_workers, default_workers
 from offbench.common.scores import interval, mean_std, normalize
 from offbench.common.seeds import Purpose, check_seed
+from offbench.common.settings import check_count
 from offbench.common.terminal import warn
 from offbench.common.text import counted
 from offbench.envs.environment_code import environment_code
@@ -81,9 +82,7 @@ def evaluate(
     Raises:
         OffbenchError: there is no run or policy, or it does not fit the environment.
     """
-    if episodes < 1:
-        raise OffbenchError(f"episodes must be at least 1, not {episodes}")
-    path, seed = Path(path), check_seed(seed)
+    path, seed, episodes = Path(path), check_seed(seed), check_count("episodes", episodes)
     policy, config, spec = open_policy(path, env)
     if stochastic and not policy.stochastic:
         raise OffbenchError(f"{path} is a deterministic policy; leave out --stochastic")

@@ -10,6 +10,7 @@ Q-value". offbench computes two readings of it:
 from __future__ import annotations
 
 import dataclasses
+import math
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from offbench.common.errors import OffbenchError
 from offbench.common.files import read_json, write_json
 from offbench.common.scores import MAX_VALUE
 from offbench.common.seeds import Purpose, check_seed, generator
-from offbench.common.settings import read_back
+from offbench.common.settings import check_count, read_back
 from offbench.training.run import Run
 
 
@@ -78,9 +79,12 @@ def similarity(
 
     from offbench.training.restore import restore
 
+    if not (0 <= tolerance < math.inf and 0 <= action_tolerance < math.inf):
+        raise OffbenchError(f"tolerances must be finite numbers from 0, not {tolerance} and {action_tolerance}")
+    samples, seed = check_count("samples", samples), check_seed(seed)
     run = Run(Path(path))
     stack = restore(run, algorithm)
-    rng = generator(check_seed(seed), Purpose.SAMPLE)
+    rng = generator(seed, Purpose.SAMPLE)
     batch = stack.store.batch(torch.from_numpy(rng.integers(stack.store.sizes[0], size=(1, samples))))
     policy = stack.policy(0)
     dim, act = len(policy.observation_mean), len(policy.low)

@@ -20,7 +20,7 @@ from offbench.analysis.methods import Method
 from offbench.analysis.results import REFERENCES, Entry, Results, Task, read_results
 from offbench.analysis.statistics import Estimate, curve, iqm, profile
 from offbench.common.arrays import Array
-from offbench.common.plotting import figure, picture_file, save
+from offbench.common.plotting import default_style, figure, picture_file, save
 from offbench.common.scores import MAX_VALUE, SCORED_EVALUATIONS
 from offbench.common.text import compact, printable
 from offbench.reports.tables import Aggregates
@@ -116,12 +116,10 @@ def plot_curves(runs: str | Path, path: str | Path, steps: int | None = None) ->
     Raises:
         OffbenchError: there are no evaluated runs, or the figure cannot be written.
     """
-    import matplotlib as mpl
-
     path = picture_file(path)
     results = read_results(runs, steps=steps)
     styles = line_styles(results.methods)
-    with mpl.rc_context(_rc_params(path.stem)):
+    with default_style(_rc_params(path.stem)):
         fig, panels = figure(len(results.tasks))
         for axes, task in zip(panels, results.tasks, strict=True):
             entries = results.on(task)
@@ -291,9 +289,9 @@ def _draw(
     name: str, caption: str, alt: str, paint: Callable[[Axes], None], legend: Sequence[LineStyle] = ()
 ) -> Figure:
     """Draw a figure and save it in its three forms."""
-    import matplotlib as mpl
+    from matplotlib.ticker import MaxNLocator
 
-    with mpl.rc_context(_rc_params(name)):
+    with default_style(_rc_params(name)):
         fig, (axes,) = figure()
         fig.set_size_inches(*SIZE)
         fig.patch.set_alpha(0)
@@ -301,7 +299,7 @@ def _draw(
         paint(axes)
         axes.ticklabel_format(axis="x", style="plain", useOffset=False)
         axes.xaxis.set_major_formatter(lambda value, _: _tick(value))
-        axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+        axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
         inline = _saved(fig, "svg").decode()
         fig.patch.set_alpha(1)
         if legend:

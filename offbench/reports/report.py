@@ -30,6 +30,7 @@ from offbench.reports.sweep import best_table
 from offbench.reports.tables import is_papers_grid, scale
 
 PAGE = "index.html"
+LINKS = re.compile(r'href="((?:tables|figures)/[\w.-]+\.\w+)"')  # of the page to its tables and figures
 TITLE = "Offline RL benchmark"
 STATES = {"unfinished": ("is unfinished", "are unfinished"), "diverged": ("diverged", "diverged")}
 
@@ -40,8 +41,8 @@ def report(
     *,
     title: str | None = None,
     steps: int | None = None,
-    datasets: Sequence[str] | None = None,
-    methods: Sequence[str] | None = None,
+    datasets: str | Sequence[str] | None = None,
+    methods: str | Sequence[str] | None = None,
 ) -> Path:
     """Write the report of the runs below one or more folders.
 
@@ -80,21 +81,22 @@ def report(
 
 
 def _earlier_files(folder: Path) -> set[Path]:
-    """Return the tables and figures of an older report. Raises OffbenchError if it holds another program's page."""
+    """Return the files that the page of an older report links to.
+
+    Raises:
+        OffbenchError: the folder holds another program's page.
+    """
     if folder.exists() and not folder.is_dir():
         raise OffbenchError(f"{folder} is a file; give another --out")
     path = folder / PAGE
     try:
         with read_errors(str(path), "is not a report of offbench", "give another --out"):
-            if GENERATOR.encode() not in read_bytes(path):
+            text = read_bytes(path).decode(errors="replace")
+            if GENERATOR not in text:
                 raise ValueError("it lacks the generator tag of offbench")
     except FileNotFoundError:
         return set()
-    return {
-        path
-        for kind in ("tables/*.csv", "tables/*.md", "tables/*.tex", "figures/*.png", "figures/*.svg")
-        for path in folder.glob(kind)
-    }
+    return {folder / name for name in LINKS.findall(text)}
 
 
 def _tables(results: Results, aggregates: tables.Aggregates) -> dict[str, Table]:

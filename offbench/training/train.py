@@ -15,7 +15,7 @@ from typing import Any
 from offbench.algorithm.interface import Algorithm
 from offbench.common.errors import OffbenchError
 from offbench.common.seeds import check_seed
-from offbench.common.settings import without_numpy
+from offbench.common.settings import check_count, without_numpy
 from offbench.data.minari_store import check_type
 from offbench.envs.recipes import load_recipe
 from offbench.training.claim import check_folders, claim_unfinished
@@ -205,6 +205,4 @@ def _check_schedule(schedule: TrainingSchedule) -> None:
     if not schedule.seeds or len(set(schedule.seeds)) < len(schedule.seeds):
         raise OffbenchError(f"seeds must be different whole numbers, not {list(schedule.seeds)}")
     for name in ("steps", "eval_every", "eval_episodes"):
-        value = getattr(schedule, name)
-        if not isinstance(value, int) or value < 1:
-            raise OffbenchError(f"{name} must be a whole number from 1, not {value}")
+        check_count(name, getattr(schedule, name))

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from offbench.analysis.methods import Method, find_method, name_methods, unnamed_settings
+from offbench.analysis.methods import Method, find_method, method_order, name_methods, unnamed_settings
 from offbench.common.errors import OffbenchError
 from offbench.training.run_config import RunConfig
 
@@ -102,3 +102,14 @@ def test_every_spelling_is_found() -> None:
     assert find_method(methods, "bdb").variant == "default"
     with pytest.raises(OffbenchError, match=r"no method 'bdb/beta=0.51' here: did you mean 'bdb \(beta=0.5\)'"):
         find_method(methods, "bdb/beta=0.51")
+
+
+def test_the_variants_of_a_sweep_are_ordered_by_their_numbers() -> None:
+    order = [
+        *(("td3_bc", v, None) for v in ("default", "alpha=0.5", "alpha=1", "alpha=2.5", "alpha=10", "alpha=1e3")),
+        *(("bdb", f"beta={beta}", beta) for beta in (0.25, 0.5)),
+        ("bdb", "default", "adaptive"),
+        *(("bdb", f"hidden={hidden}", "adaptive") for hidden in ("64x64", "64x256", "256")),
+    ]
+    methods = named(*order[::-1])
+    assert [method.variant for method in sorted(methods, key=method_order)] == [variant for _, variant, _ in order]

@@ -17,6 +17,7 @@ import offbench
 from offbench.analysis.normalize import FORMATS, notes, render
 from offbench.analysis.results import read_results
 from offbench.cli.main import main
+from offbench.common.errors import OffbenchError
 from offbench.common.scores import interval, mean_std, normalize, run_return
 from offbench.envs.recipes import d4rl_reference_of_env
 from offbench.reports.figures import plot_curves
@@ -135,8 +136,31 @@ def test_runs_whose_scores_do_not_compare_are_refused(differ: dict[str, Any], ho
 
 
 def test_numpys_numbers_are_numbers() -> None:
-    for returns in (np.array([12135.0]), np.array([12135.0, 0.0])):
-        assert offbench.normalize(env="halfcheetah", returns=returns)[0]["d4rl_score"] == 100
+    for returns in (
+        np.array([12135.0]),
+        np.array([12135.0, 0.0]),
+        np.array([12135.0], np.float32),
+        [np.float32(12135)],
+    ):
+        rows = offbench.normalize(env="halfcheetah", returns=returns)
+        assert rows[0]["d4rl_score"] == 100
+        assert json.loads(render(rows, "json"))[0]["return"] == 12135
+
+
+def test_what_the_command_line_refuses_is_refused_in_python_too(capsys: pytest.CaptureFixture[str]) -> None:
+    write_run(0, [90.0])
+    with pytest.raises(OffbenchError, match="unknown format 'md'"):
+        render([], "md")
+    assert [render([], style) for style in ("csv", "table", "json")] == ["", "", "[]"]
+    for steps in ("100", True, 1.5):
+        with pytest.raises(OffbenchError, match="steps must be a whole number from 1, not"):
+            offbench.normalize(steps=steps)  # type: ignore[arg-type]
+    with pytest.raises(OffbenchError, match="unknown method '1'"):
+        offbench.compare("bdb", 1)  # type: ignore[arg-type]
+    with pytest.raises(OffbenchError, match="a seed is a whole number"):
+        offbench.evaluate("runs", seed=True)
+    main(["normalize", "--env", "halfcheetah", "-1e3", "-280.18", "--format", "csv"])
+    assert [row["return"] for row in csv.DictReader(io.StringIO(capsys.readouterr().out))] == ["-1000.0", "-280.18"]
 
 
 def test_returns_of_an_environment() -> None:

@@ -63,7 +63,7 @@ def test_between_two_evaluations_a_run_is_as_at_the_first_of_them(capsys: pytest
     assert (row["steps"], row["of_steps"]) == (20_000, 20_000)
     main(["compare", "td3_bc", "bc", "--steps", "25000"])
     assert "did not reach" not in capsys.readouterr().out
-    with pytest.raises(OffbenchError, match="steps must be at least 1, not -5"):
+    with pytest.raises(OffbenchError, match="steps must be a whole number from 1, not -5"):
         offbench.normalize(steps=-5)
 
 

@@ -30,6 +30,7 @@ WITH_SIMILARITY = "evaluate runs/a --similarity"
 LINES = {
     **{("evaluate", name): WITH_SIMILARITY for name in ("algorithm", "tolerance", "action_tolerance", "similarity")},
     ("benchmark", "address"): "benchmark smoke --executor ray",
+    ("list", "runs"): "list runs",
 }
 # options that choose another function
 OTHER_FUNCTIONS = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import re
@@ -18,6 +19,8 @@ import pytest
 from offbench.cli.main import BY_NAME, COMMANDS, main
 from tests.made_runs import made_grid, made_run
 
+NORMALIZE = [sys.executable, "-m", "offbench", "normalize"]
+IN_ASCII = os.environ | {"PYTHONIOENCODING": "ascii"}
 COLOR = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -202,3 +205,31 @@ def test_the_adaptive_beta_is_explained_and_the_next_command_can_be_pasted(
         assert err.splitlines()[-1] == "next: offbench normalize --runs 'my runs'"
         assert len(out.splitlines()) == 1
     assert "beta=0.5" in "".join(str(path) for path in Path("my runs").rglob("seed-0"))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "koi8-r"])
+def test_an_encoding_without_the_characters_of_a_table(screen: Callable[..., str], home: Path, encoding: str) -> None:
+    for seed in range(2):
+        made_run(home / "runs", "hopper-medium-v0", "bc", "default", seed, 40)
+    assert re.search(r"\d \\xb1 \d", screen(80, "normalize", PYTHONIOENCODING=encoding))
+    assert re.search(r"\d \\xb1 \d", subprocess.check_output(NORMALIZE, cwd=home, text=True, env=IN_ASCII))
+
+
+def test_only_the_end_of_the_reader_ends_a_command_quietly(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made_run(home / "runs", "hopper-medium-v0", "bc", "default", 0, 40)
+    with subprocess.Popen(NORMALIZE, cwd=home, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        process.stdout.close()
+        assert process.stderr
+        assert (process.stderr.read(), process.wait()) == ("", 0)
+
+    def broken(**_: object) -> None:
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")  # of a worker process, for example
+
+    monkeypatch.setattr("offbench.normalize", broken)
+    with pytest.raises(SystemExit) as end:
+        main(["normalize"])
+    assert end.value.code == 2
+    assert "Broken pipe" in capsys.readouterr().err

@@ -106,6 +106,18 @@ def test_a_narrow_terminal_shows_the_bar_and_the_whole_note(clock: Clock, monkey
     assert re.search(r"v0 ━+╸? +50% 1,500/3,000, 10 s left$", line)
 
 
+def test_a_long_title_is_cut_before_the_time_left(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: True)
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "60")
+    with progress.Progress(3000, "recording halfcheetah-medium-expert-v0") as bar:
+        clock.now = 10.0
+        bar.to(1500)
+    assert re.search(r"recording halfche\.\.\. .*50%.*1,500/3,000, 10 s left", screen.getvalue())
+
+
 def test_a_log_has_a_line_for_every_evaluation(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     with progress.Progress(1000, "td3_bc on x-v0") as bar:
         for step in range(10, 501, 10):

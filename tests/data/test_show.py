@@ -55,7 +55,7 @@ def test_the_summary_by_hand(four_episodes: str) -> None:
 
 def test_the_figure_by_hand(four_episodes: str, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Figure] = []
-    monkeypatch.setattr("offbench.common.plotting.save", lambda fig, path: drawn.append(fig))
+    monkeypatch.setattr("offbench.data.show.save", lambda fig, path: drawn.append(fig))
     offbench.show(four_episodes).plot("returns.png")
     (axes,) = drawn[0].axes
     bars = {round(bar.get_x(), 3): bar.get_height() for bar in axes.patches if bar.get_height()}  # type: ignore[attr-defined]

@@ -173,12 +173,20 @@ def test_escape_sequences_are_shown_not_obeyed(tmp_path: Path, capsys: pytest.Ca
     assert printable("\u061c\u200b\u2028\U000e0041") == "\\u061c\\u200b\\u2028\\U000e0041"
 
 
-@pytest.mark.parametrize("cell", ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\t=1", " =1", "\n=1"])
+@pytest.mark.parametrize(
+    "cell", ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\t=1", " =1", "\n=1", "-1 (A1*2)"]
+)
 def test_no_cell_is_a_formula(cell: str) -> None:
     text = normalize.render([{"dataset": cell, "return": -1.5}], "csv")
     header, row = csv.reader(io.StringIO(text))
     assert (header, row) == (["dataset", "return"], ["'" + cell, "-1.5"])
-    assert no_formula("-1.5") == "-1.5"
+
+
+@pytest.mark.parametrize(
+    "cell", ["-1.5", "-1e-05", "-inf", "-287.1 to 10,964.8", "-1.2 ± 3.0 (50,000 of 1,000,000 steps)"]
+)
+def test_a_negative_number_is_no_formula(cell: str) -> None:
+    assert no_formula(cell) == cell
 
 
 def test_a_fifo_is_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

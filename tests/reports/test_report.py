@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from matplotlib import rc_context
 
 import offbench
 from offbench.analysis.methods import EXTENSION_SETTINGS, Method
@@ -21,6 +22,9 @@ from offbench.training.former_settings import MOVED
 from offbench.training.registry import load_algorithm
 from tests.made_runs import METHODS, made_grid, made_run
 from tests.pages import Page, rows
+
+# settings of a user's matplotlibrc
+USERS_STYLE = {"axes.facecolor": "black", "lines.linewidth": 9, "savefig.bbox": "tight", "figure.dpi": 30}
 
 
 def test_a_whole_grid(home: Path) -> None:
@@ -327,8 +331,9 @@ def test_a_file_where_the_report_should_be(home: Path, capsys: pytest.CaptureFix
 def test_the_same_runs_give_the_same_bytes(home: Path) -> None:
     made_grid(home / "runs", seeds=2, levels=2)
     shutil.copytree(home / "runs", home / "elsewhere")
-    for runs, out in (("runs", "one"), ("elsewhere", "two")):
-        main(["report", "--runs", runs, "--out", out])
+    for runs, out, style in (("runs", "one", {}), ("elsewhere", "two", USERS_STYLE)):
+        with rc_context(style):
+            main(["report", "--runs", runs, "--out", out])
     first, second = (
         {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
         for root in (home / "one", home / "two")
@@ -340,13 +345,15 @@ def test_an_older_report_is_replaced_whole(home: Path) -> None:
     made_grid(home / "runs", seeds=1, levels=1)
     other = made_run(home / "runs", "my-data-v0", "td3_bc", "default", 0, 50)
     offbench.report(home / "runs", home / "out")
-    (home / "out" / "notes.txt").write_text("mine")
+    mine = {"notes.txt", "tables/mine.csv", "figures/mine.png"}
+    for name in mine:
+        (home / "out" / name).write_text("mine")
     assert (home / "out" / "figures" / "curves-my-data-v0.png").exists()
     shutil.rmtree(other.folder)
     offbench.report(home / "runs", home / "out")
     offbench.report(home / "runs", home / "fresh")
     names = [{str(p.relative_to(home / out)) for p in (home / out).rglob("*")} for out in ("out", "fresh")]
-    assert names[0] - names[1] == {"notes.txt"}
+    assert names[0] - names[1] == mine
     assert names[1] <= names[0]
 
 
