@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 
 from offbench.benchmarks.datasets import record_dataset
 from offbench.benchmarks.grid import GridDataset
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import LockedError, OffbenchError
 from offbench.common.files import write_bytes
 from offbench.common.processes import environment
 from offbench.data import minari_store
@@ -50,6 +50,7 @@ SLICE = 600.0  # seconds that a task trains before it returns
 RETRIES = 5  # times that Ray runs a lost task again
 TIMEOUT = 5.0  # seconds to wait for a cluster
 POLL = 1.0  # seconds between two checks of the tasks
+LOCKED = 30.0  # seconds that a task tries again while another process holds a run or a dataset
 LEFT_OUT = (".lock", ".holder", ".tmp")  # endings of files that belong to one process
 
 Files = dict[str, bytes]
@@ -341,10 +342,15 @@ def _record_here(source: GridDataset, driver: Driver, server: ActorHandle) -> li
 
 
 def _task(work: Callable[[], list[str]], title: str) -> tuple[bool, list[str]]:
-    """Return whether the task succeeded, and what went wrong."""
-    try:
-        return True, work()
-    except OffbenchError as error:
-        return False, [f"{title}: {error}"]
-    except Exception:  # a bug of offbench or of a third party's algorithm: the driver shows all of it
-        return False, [f"{title}: {traceback.format_exc()}"]
+    """Do the work of a task; return whether it succeeded, and what went wrong."""
+    began = time.monotonic()
+    while True:
+        try:
+            return True, work()
+        except LockedError as error:  # perhaps by a process of a lost node, which ends soon
+            if time.monotonic() - began > LOCKED:
+                return False, [f"{title}: {error}"]
+        except OffbenchError as error:
+            return False, [f"{title}: {error}"]
+        except Exception:  # a bug of offbench or of a third party's algorithm: the driver shows all of it
+            return False, [f"{title}: {traceback.format_exc()}"]

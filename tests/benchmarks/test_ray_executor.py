@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -95,6 +96,23 @@ def test_a_lost_node_changes_nothing(two_nodes: Any, home: Path) -> None:
     nodes.wait_for_nodes(60)  # the one that joined among them
     assert len(nodes.list_all_nodes()) == 3
     same(home, "local", "ray")
+
+
+def test_a_task_waits_for_the_processes_of_a_lost_node(home: Path, medium: str) -> None:
+    """They end some seconds after Ray has started their tasks again elsewhere."""
+    config: Any = load_algorithm("td3_bc").Config(hidden=(16, 16))
+    spec = RunSpec("td3_bc", config, medium, 0, 100, 100, 1, home / "runs" / medium / "td3_bc/default/seed-0")
+    (job,) = Training([spec], Machine("cpu", 1)).jobs
+    script = "import sys, time; from offbench.training.run import Run; from pathlib import Path\n"
+    script += "with Run(Path(sys.argv[1])).locked(): print('locked', flush=True); time.sleep(5)"
+    words = [sys.executable, "-c", script, str(spec.folder)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as lost:
+        assert lost.stdout
+        assert lost.stdout.readline() == "locked\n"
+        began = time.monotonic()
+        assert ray_executor._task(lambda: train_job(job, lambda *_: None), job.title) == (True, [])
+    assert time.monotonic() - began > 3
+    assert spec.run.finished(100)
 
 
 def test_a_slice_begins_when_its_task_does(home: Path, medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
