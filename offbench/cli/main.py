@@ -314,7 +314,11 @@ class _MainParser(Parser):
         lines += ["", "Quickstart:"]
         first = ("collect", "train", "normalize", "report")
         lines += [f"  offbench {BY_NAME[name].examples[0]}" for name in first]
-        lines += ["", "`offbench COMMAND --help` shows the options of a command, with examples."]
+        lines += [
+            "",
+            "`offbench COMMAND --help` shows the options of a command, with examples.",
+            "`offbench --version` prints the version.",
+        ]
         return "\n".join(lines) + "\n"
 
 
