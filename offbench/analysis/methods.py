@@ -128,10 +128,15 @@ def find_method(methods: Sequence[Method], name: str) -> Method:
     Raises:
         OffbenchError: no such method here, or the algorithm has several variants.
     """
-    name = without_steps(str(name))
-    for matches in ([m for m in methods if m.label == name], [m for m in methods if name in m.spellings]):
-        if len(matches) == 1:
-            return matches[0]
+    one_line = " ".join(str(name).split())
+    by_label = {" ".join(method.label.split()): method for method in methods}
+    name = without_steps(one_line)
+    for label in (one_line, name):
+        if label in by_label:
+            return by_label[label]
+    matches = [method for method in methods if name in method.spellings]
+    if len(matches) == 1:
+        return matches[0]
     algorithm = re.split(r"[/ ]", name)[0]
     variants = [method for method in methods if method.algorithm == algorithm]
     labels = ", ".join(f"'{method.label}'" for method in variants or methods)

@@ -126,7 +126,7 @@ def _sign_flip(differences: Scores) -> float:
     weighted = np.concatenate([np.asarray(v) / (len(v) * len(differences)) for v in differences.values()])
     count = len(weighted)
     observed = abs(float(weighted.sum()))
-    slack = 1e-12 * max(1.0, float(np.abs(weighted).max()))  # sums in another order differ by rounding
+    slack = 1e-12 * float(np.abs(weighted).max())  # sums in another order differ by rounding
     if count <= EXACT_FLIPS:
         bits = np.arange(2**count)[:, None] >> np.arange(count) & 1
         return float((np.abs((1 - 2 * bits) @ weighted) >= observed - slack).mean())

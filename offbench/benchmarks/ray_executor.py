@@ -352,5 +352,5 @@ def _task(work: Callable[[], list[str]], title: str) -> tuple[bool, list[str]]:
                 return False, [f"{title}: {error}"]
         except OffbenchError as error:
             return False, [f"{title}: {error}"]
-        except Exception:  # a bug of offbench or of a third party's algorithm: the driver shows all of it
+        except (Exception, SystemExit):  # of offbench or of a user's algorithm: the driver shows all of it
             return False, [f"{title}: {traceback.format_exc()}"]

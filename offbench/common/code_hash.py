@@ -59,7 +59,7 @@ def module_code(name: str) -> dict[str, str]:
     else:
         files = _installed_with(package, file.parent) or imported_files(file, file.parent, {})
         found = [(path, file.parent) for path in {file: None, **files}]
-    return {str(path.relative_to(root)): file_hash(path) for path, root in found} | package_versions(package)
+    return {path.relative_to(root).as_posix(): file_hash(path) for path, root in found} | package_versions(package)
 
 
 @functools.cache

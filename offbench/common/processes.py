@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import multiprocessing
 import operator
 import os
 import signal
@@ -129,9 +130,15 @@ def closing() -> bool:
     return _Worker.closing is not None and bool(_Worker.closing.value)
 
 
+def _lives(parent: int) -> bool:
+    """Return whether the parent of this process lives; on Windows, getppid still returns it after its end."""
+    process = multiprocessing.parent_process()
+    return os.getppid() == parent and (process is None or process.is_alive())
+
+
 def _watch(parent: int) -> None:
-    while os.getppid() == parent and not closing():
+    while _lives(parent) and not closing():
         time.sleep(1.0)
-    if os.getppid() == parent:
+    if _lives(parent):
         time.sleep(GRACE)  # the pool ends its workers itself, unless one of them was killed
     os._exit(1)

@@ -62,7 +62,7 @@ def compact(number: int) -> str:
 
 def without_steps(heading: str) -> str:
     """Return a method's name from a column's heading: `td3_bc` from `td3_bc (300,000 steps)`."""
-    return re.sub(r" \([\d,]+( of [\d,]+)? steps\)$", "", " ".join(heading.split()))
+    return re.sub(r" \(([\d,]+( of [\d,]+)? steps|steps differ)\)$", "", " ".join(heading.split()))
 
 
 # control characters except tab and line feed; characters that reverse text, break lines or are invisible

@@ -95,11 +95,22 @@ def model_of(env: gym.Env[Array, Array]) -> mujoco.MjModel | None:
 
 
 def _colliding(model: mujoco.MjModel) -> tuple[Array, Array]:
-    """Return the pairs of geoms, two arrays [P], that MuJoCo may test for contact: of two bodies, types that match."""
+    """Return the pairs of geoms, two arrays [P], that MuJoCo may test for contact.
+
+    It tests geoms whose types match, not those of one body or of bodies welded together, of parent and child (but for
+    children of the world), or of bodies that <exclude> names.
+    """
     first, second = np.triu_indices(model.ngeom, 1)
-    body, types, affinities = model.geom_bodyid, model.geom_contype, model.geom_conaffinity
+    types, affinities = model.geom_contype, model.geom_conaffinity
     match = (types[first] & affinities[second]) | (types[second] & affinities[first])
-    may = (match != 0) & (body[first] != body[second])
+    bodies = np.sort([model.geom_bodyid[first], model.geom_bodyid[second]], axis=0)
+    one, other = model.body_weldid[bodies]
+    parents = model.body_weldid[model.body_parentid[model.body_weldid]]
+    related = (one != 0) & (other != 0) & ((one == parents[other]) | (other == parents[one]))
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+        related[:] = False
+    excluded = np.isin((bodies[0] << 16) + bodies[1], model.exclude_signature)
+    may = (match != 0) & (one != other) & ~related & ~excluded
     return first[may], second[may]
 
 

@@ -44,9 +44,13 @@ def environment_code(env_spec: str) -> dict[str, str]:
 
 
 def _files(name: str, value: object) -> Iterator[tuple[str, str]]:
-    """Yield the files that an argument names, each with the argument's name: `scene`, `assets.0`."""
+    """Yield the files that an argument names, each with the argument's name: `scene`, `assets.0`.
+
+    A word without a folder and an ending (`float32`) names no file, whatever the current folder holds.
+    """
     if isinstance(value, str) and os.path.isfile(path := os.path.expanduser(value)):
-        yield name, path
+        if os.path.basename(path) != path or os.path.splitext(path)[1]:
+            yield name, path
     elif isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
             yield from _files(f"{name}.{key}".lstrip("."), item)

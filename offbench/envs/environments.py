@@ -49,7 +49,7 @@ def env_spec(env_id: str, **kwargs: Any) -> str:
             env = gym.make(env_id, **kwargs)
         assert env.spec is not None
         text = env.spec.to_json()
-    except Exception as error:  # a third-party environment may raise anything here
+    except (Exception, SystemExit) as error:  # a third-party environment may raise anything here
         if is_exhausted(error):
             raise
         hint = _remedy(error)
@@ -137,7 +137,7 @@ def untrusted_env(text: str, where: str) -> Env:
         return env
     except OffbenchError as error:
         raise OffbenchError(f"{where}: {error}") from None
-    except Exception as error:  # see env_spec
+    except (Exception, SystemExit) as error:  # see env_spec
         if is_exhausted(error):
             raise
         raise OffbenchError(

@@ -25,8 +25,13 @@ def loaded_files(model: Path) -> dict[str, str]:
         bases = {os.path.dirname(file) for file in files}
         paths = {os.path.normpath(os.path.join(*parts)) for parts in itertools.product(bases, folders, names)}
         if not (new := {path for path in paths if os.path.isfile(path)} - files):
-            return {os.path.relpath(path, model.parent): sha256_of(Path(path)) for path in sorted(files - root)}
+            return {_relative(path, model): sha256_of(Path(path)) for path in sorted(files - root)}
         files = files | new
+
+
+def _relative(path: str, model: Path) -> str:
+    """Return a path relative to a model's folder, the same text on each operating system."""
+    return Path(os.path.relpath(path, model.parent)).as_posix()
 
 
 def _references(files: Iterable[str]) -> tuple[set[str], set[str]]:

@@ -175,17 +175,31 @@ def _kwargs(value: object, where: str) -> tuple[tuple[str, object], ...]:
     return tuple(sorted(table.items()))
 
 
+def _check_references(recipe: Recipe, where: str) -> None:
+    low, high = recipe.d4rl_min, recipe.d4rl_max
+    if low is None or high is None:
+        if low != high:
+            raise OffbenchError(f"{where}: give both d4rl_min and d4rl_max, or neither")
+        return
+    if not are_references(low, high):
+        raise OffbenchError(f"{where}: d4rl_min and d4rl_max must be returns in this order, not {low}, {high}")
+    shipped = _shipped_recipe(recipe.env_id) if recipe.folder is None else None
+    if shipped and shipped.d4rl_min is not None and shipped.d4rl_max is not None:
+        rounding = 1e-3 * (shipped.d4rl_max - shipped.d4rl_min)
+        if max(abs(low - shipped.d4rl_min), abs(high - shipped.d4rl_max)) > rounding:
+            raise OffbenchError(
+                f"{where}: d4rl_min and d4rl_max of {recipe.env_id} are {shipped.d4rl_min} and {shipped.d4rl_max} in "
+                "D4RL; correct them, or leave them out"
+            )
+
+
 def _check(recipe: Recipe, where: str) -> None:
     if not recipe.name.replace("-", "").replace("_", "").isalnum() or not recipe.name[0].isalnum():
         raise OffbenchError(
             f"{where}: name must begin with a letter or digit and have letters, digits, - and _ only, not "
             f"{recipe.name!r}"
         )
-    if (recipe.d4rl_min is None) != (recipe.d4rl_max is None):
-        raise OffbenchError(f"{where}: give both d4rl_min and d4rl_max, or neither")
-    low, high = recipe.d4rl_min, recipe.d4rl_max
-    if low is not None and high is not None and not are_references(low, high):
-        raise OffbenchError(f"{where}: d4rl_min and d4rl_max must be returns in this order, not {low}, {high}")
+    _check_references(recipe, where)
     sac = recipe.sac
     if not sac.cycle()[1]:
         raise OffbenchError(f"{where}: [sac] gradient_steps x envs must be at least 1/64")

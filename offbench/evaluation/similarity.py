@@ -15,8 +15,6 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from offbench.common.errors import OffbenchError
 from offbench.common.files import read_json, write_json
 from offbench.common.scores import MAX_VALUE
@@ -86,15 +84,7 @@ def similarity(
     stack = restore(run, algorithm)
     rng = generator(seed, Purpose.SAMPLE)
     batch = stack.store.batch(torch.from_numpy(rng.integers(stack.store.sizes[0], size=(1, samples))))
-    policy = stack.policy(0)
-    dim, act = len(policy.observation_mean), len(policy.low)
-    policy = dataclasses.replace(  # acts on normalized observations, in [-1, 1], as the critic sees them
-        policy,
-        observation_mean=np.zeros(dim, np.float32),
-        observation_std=np.ones(dim, np.float32),
-        low=-np.ones(act, np.float32),
-        high=np.ones(act, np.float32),
-    )
+    policy = stack.normalized_policy(0)  # as the critic sees observations and actions
     noise = policy.draw(rng, samples) if policy.needs_noise(deterministic=True) else None
     pi = torch.from_numpy(policy.act(batch.observations[0].numpy(), noise)).unsqueeze(0)
     q_pi, q_data = (stack.algorithm.q_values(batch.observations, a) for a in (pi, batch.actions))

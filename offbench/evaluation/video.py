@@ -31,7 +31,7 @@ from offbench.envs.recipes import load_recipe
 from offbench.evaluation.evaluate import open_policy
 from offbench.evaluation.renderer import NO_RENDERER, rendering_with, working_backend
 from offbench.rollouts.policy import Policy, uniform_policy
-from offbench.rollouts.rollouts import reset, step
+from offbench.rollouts.rollouts import in_space, reset, step
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -104,7 +104,7 @@ def _policy_of(path: str, env: str | Path | None) -> tuple[Policy, str, bool]:
     name, colon, level = path.rpartition(":")
     if not colon or Path(path).exists():
         policy, _, spec = open_policy(Path(path), env)
-        return policy, spec, policy.kind == "uniform"
+        return policy, spec, False
     if env is not None:
         raise OffbenchError(f"{path} names its environment already; leave out --env, or give a policy file")
     recipe = load_recipe(name)
@@ -134,7 +134,7 @@ def _renderable(env_spec: str, backend: str | None) -> Env:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about an unlisted mode: the first frame shows whether it works
             env = make_env(env_spec, "rgb_array")
-    except Exception as error:  # a third party's environment may raise anything here
+    except (Exception, SystemExit) as error:  # a third party's environment may raise anything here
         raise OffbenchError(
             f"{json.loads(env_spec)['id']} cannot be rendered (render_mode rgb_array): {error}"
         ) from error
@@ -156,7 +156,7 @@ def _frames(
     env: Env, policy: Policy, sampled: bool, seed: int, episodes: int, frame_interval: int, max_steps: float, size: int
 ) -> Iterator[Image]:
     """Play up to `max_steps` steps; yield every `frame_interval`-th frame, and the first and last of each episode."""
-    noisy = policy.needs_noise(not sampled)
+    noisy, (_, space) = policy.needs_noise(not sampled), spaces_of(env, policy.env_id)
     for index in range(episodes):
         if max_steps <= 0:
             return
@@ -166,7 +166,8 @@ def _frames(
         yield _frame(env, count, total, size)
         while not done:
             noise = policy.draw(rng, 1) if noisy else None
-            observation, reward, terminated, truncated = step(env, policy.act(observation[None], noise)[0])
+            action = in_space(policy.act(observation[None], noise)[0], space)
+            observation, reward, terminated, truncated = step(env, action)
             count, total = count + 1, total + reward
             done = terminated or truncated or count >= max_steps
             if done or count % frame_interval == 0:
@@ -183,7 +184,7 @@ def _frame(env: Env, step: int, total: float, size: int) -> Image:
         pixels = env.render()
     except NotImplementedError:
         raise OffbenchError(f"{name} cannot be rendered: it has no rgb_array rendering") from None
-    except Exception as error:  # a third party's environment may raise anything here
+    except (Exception, SystemExit) as error:  # a third party's environment may raise anything here
         lacks = error.name if isinstance(error, ModuleNotFoundError) else None
         hint = f"; install the package that has {lacks}" if lacks else ""  # Gymnasium's own errors say which
         raise OffbenchError(f"{name} cannot be rendered: {str(error) or type(error).__name__}{hint}") from error
@@ -232,15 +233,15 @@ def _encoder() -> Callable[[Path, Iterator[Image], float], None]:
         with write_errors(str(path)):
             try:
                 first, count = next(frames), 1
-                writer = imageio_ffmpeg.write_frames(
+                writing = imageio_ffmpeg.write_frames(
                     str(temporary), first.size, fps=fps, macro_block_size=2, quality=7
                 )
-                writer.send(None)
-                writer.send(first.tobytes())
-                for frame in frames:
-                    writer.send(frame.tobytes())
-                    count += 1
-                writer.close()
+                with contextlib.closing(writing) as writer:
+                    writer.send(None)
+                    writer.send(first.tobytes())
+                    for frame in frames:
+                        writer.send(frame.tobytes())
+                        count += 1
                 check_frames(temporary, count)
                 temporary.replace(path)
             finally:

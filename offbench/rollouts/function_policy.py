@@ -48,7 +48,7 @@ class FunctionPolicy:
         for observation in observations:
             try:
                 action = np.asarray(self.function(observation), np.float64).reshape(-1)
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 what = f"{type(error).__name__}: {error}"
                 raise OffbenchError(f"the policy {self.name} failed: {what} ({SHOW_TRACEBACK})") from error
             if action.shape != self.low.shape or not np.isfinite(action).all():

@@ -105,8 +105,8 @@ class Policy:
         batch, size = np.atleast_2d(np.asarray(observation)), len(self.observation_mean)
         if batch.ndim != 2 or batch.shape[1] != size:
             raise OffbenchError(f"the policy takes observations ({size},), not {np.shape(observation)}")
-        noisy = self.kind == "uniform" or self.needs_noise(rng is None)
-        actions = self.act(batch, self.draw(rng or self._rng, len(batch)) if noisy else None)
+        noise = self.draw(rng or self._rng, len(batch)) if self.needs_noise(rng is None) else None
+        actions = self.act(batch, noise)
         return actions if np.ndim(observation) == 2 else actions[0]
 
     @functools.cached_property
@@ -128,8 +128,8 @@ class Policy:
         return self.kind in ("squashed_gaussian", "gaussian", "uniform")
 
     def needs_noise(self, deterministic: bool) -> bool:
-        """Return whether `act` must be given noise: to sample, or to have actions to choose from."""
-        return self.kind == "best_by_q" or (self.stochastic and not deterministic)
+        """Return whether `act` must be given noise: to sample, or if the policy has no single best action."""
+        return self.kind in ("best_by_q", "uniform") or (self.stochastic and not deterministic)
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
         """Return the noise of `count` actions, [count, act]: normal, or uniform in [-1, 1].
@@ -145,7 +145,7 @@ class Policy:
         """Return the actions [n, act] for observations [n, obs], in the environment's bounds.
 
         Args:
-            noise: from `draw`, or None to act deterministically (the mode; uniform has none: zeros).
+            noise: from `draw`, or None to act deterministically (the mode; the middle of the bounds if uniform).
         """
         double = self._double
         if self.kind == "gaussian":

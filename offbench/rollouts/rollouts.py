@@ -136,9 +136,7 @@ class _RunningEpisode:
 
     def step(self, action: Array) -> Episode | None:
         """Take one step; return the whole episode if it was the last one."""
-        action = action.astype(self.space.dtype)
-        if self.space.dtype != np.float32:  # policies round to float32, which may be beyond these bounds
-            action = np.clip(action, self.space.low, self.space.high)
+        action = in_space(action, self.space)
         observation, reward, terminated, truncated = step(self.env, action.copy())  # it may change its copy
         self.observations.append(observation)
         self.actions.append(action)
@@ -157,11 +155,17 @@ class _RunningEpisode:
         return Episode(self.seed, observations, np.array(self.actions), rewards, *ends)
 
 
+def in_space(action: Array, space: gym.spaces.Box) -> Array:
+    """Return a copy of a policy's action [act] in the precision and the bounds of an action space."""
+    action = action.astype(space.dtype)  # policies round to float32, which may be beyond other bounds
+    return action if space.dtype == np.float32 else np.clip(action, space.low, space.high)
+
+
 def reset(env: Env, seed: int | None) -> Array:
     """Return a copy of an episode's first observation. Raises OffbenchError if the environment fails; it is named."""
     try:
         return _observation(env, env.reset(seed=seed)[0])
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise _failed(env, error) from error
 
 
@@ -174,7 +178,7 @@ def step(env: Env, action: Array) -> tuple[Array, float, bool, bool]:
     try:
         observation, reward, terminated, truncated, _ = env.step(action)
         return _observation(env, observation), scalar_reward(reward), bool(terminated), bool(truncated)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise _failed(env, error) from error
 
 
@@ -216,7 +220,7 @@ def scalar_reward(reward: SupportsFloat) -> float:
     return float(reward)
 
 
-def _failed(env: Env, error: Exception) -> Exception:
+def _failed(env: Env, error: BaseException) -> Exception:
     """Return what to raise for an exception of an environment."""
     if isinstance(error, OffbenchError | MemoryError):
         return error
@@ -281,7 +285,7 @@ def cached_envs(env_spec: str, count: int) -> list[Env]:
     while len(pool) < count:
         try:
             pool.append(make_env(env_spec))
-        except Exception as error:  # a worker may lack what the process that started it has
+        except (Exception, SystemExit) as error:  # a worker may lack what the process that started it has
             raise OffbenchError(f"cannot make an environment in a worker process: {reason(error)}") from error
     return pool[:count]
 

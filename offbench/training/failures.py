@@ -13,7 +13,7 @@ from offbench.common.files import OPEN_FILES, READ_REMEDIES, is_out_of_memory
 from offbench.training.registry import algorithm_packages
 
 
-def describe_failure(error: Exception, write_traceback: Callable[[str], object] | None = None) -> str:
+def describe_failure(error: BaseException, write_traceback: Callable[[str], object] | None = None) -> str:
     """Describe any exception in one line: what went wrong and what to do about it.
 
     Args:

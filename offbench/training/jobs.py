@@ -126,13 +126,13 @@ def _train_here(job: Job, index: int, progress: JobProgress) -> list[str]:
         return []
     try:
         return train_job(job, lambda step, note: progress.report(index, step, note))
-    except Exception as error:
-        if len(progress.jobs) == 1:
+    except (Exception, SystemExit) as error:  # an algorithm of the user's own may call sys.exit
+        if len(progress.jobs) == 1 and isinstance(error, Exception):
             raise
         return [_problem(job, error, progress.print_trace)]
 
 
-def _problem(job: Job, error: Exception, write_traceback: Callable[[str], object]) -> str:
+def _problem(job: Job, error: BaseException, write_traceback: Callable[[str], object]) -> str:
     """Return a line that describes the failure of one of several jobs."""
     return (
         str(error) if isinstance(error, OffbenchError) else f"{job.title}: {describe_failure(error, write_traceback)}"
@@ -215,6 +215,6 @@ def _worker(job: Job, sender: Connection, parent: int) -> None:
     try:
         check_algorithm_code(job)
         lines = train_job(job, lambda step, note: sender.send((step, note)))
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         lines = [_problem(job, error, traces.append)]
     sender.send(_End(lines, "".join(traces)))

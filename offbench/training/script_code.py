@@ -42,7 +42,7 @@ def script_code(classes: list[type]) -> dict[str, str]:
             hashes[f"{MAIN}{name}{PART_OF}content"] = content
         elif file := _file_beside(value):
             for path in imported_files(file, file.parent, {}):
-                hashes[f"{MAIN}{path.relative_to(file.parent)}"] = file_hash(path)
+                hashes[f"{MAIN}{path.relative_to(file.parent).as_posix()}"] = file_hash(path)
     return hashes
 
 

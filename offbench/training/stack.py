@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -80,17 +81,28 @@ class Stack:
 
     def policy(self, run: int) -> Policy:
         """Return one run's policy as it is now, for the NumPy rollouts and the policy file."""
-        data = self.data[run]
-        parts = self.algorithm.policy(run)
+        data, policy = self.data[run], self.normalized_policy(run)
         mean, std = self.store.normalizers[run]
+        layers = policy.layers
+        if policy.kind == "gaussian":  # such a policy file does not scale its actions: its last layer does
+            (weight, bias), half = layers[-1], (data.high - data.low) / 2
+            scale = np.concatenate([half, np.ones_like(half)])
+            shift = np.concatenate([(data.high + data.low) / 2, np.log(half)])
+            layers = (*layers[:-1], (weight * scale, bias * scale + shift))
+        return replace(policy, layers=layers, observation_mean=mean, observation_std=std, low=data.low, high=data.high)
+
+    def normalized_policy(self, run: int) -> Policy:
+        """Return one run's policy as the algorithm sees it: observations normalized, actions in [-1, 1]."""
+        data, parts = self.data[run], self.algorithm.policy(run)
         actor, critic = (tuple((w.numpy(), b.numpy()) for w, b in p) for p in (parts.layers, parts.critic))
+        zeros, ones = (np.full_like(self.store.normalizers[run][0], value) for value in (0, 1))
         return Policy(
             parts.kind,
             actor,
-            mean,
-            std,
-            data.low,
-            data.high,
+            zeros,
+            ones,
+            -np.ones_like(data.low),
+            np.ones_like(data.high),
             data.env_id,
             {"step": self.step, **self.policy_origin(run)},
             critic=critic,

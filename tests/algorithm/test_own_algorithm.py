@@ -5,10 +5,13 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import itertools
+import math
 import types
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 import torch
 
@@ -17,8 +20,10 @@ from offbench.algorithm import Algorithm, Network, PolicyParts, normal, setting
 from offbench.algorithm.interface import Distribution
 from offbench.common.errors import OffbenchError
 from offbench.training import registry
+from offbench.training.datasets import load_datasets
 from offbench.training.registry import algorithm_names, load_algorithm
-from offbench.training.spec import TrainingSchedule
+from offbench.training.spec import TrainingSchedule, specs_of
+from offbench.training.stack import Stack
 from tests.cli.test_bad_input import refusal
 
 
@@ -238,3 +243,32 @@ def test_every_option_of_train_is_reserved() -> None:
     assert options | entry | {"help"} <= registry.RESERVED_SETTINGS
     for name in algorithm_names():
         assert not registry.RESERVED_SETTINGS & {f.name for f in dataclasses.fields(load_algorithm(name).Config)}
+
+
+def gaussian(self: Any, run: int = 0) -> PolicyParts:
+    """A mean of the first action's bias alone, and a standard deviation of e^-1."""
+    layers = [(torch.zeros_like(w), torch.zeros_like(b)) for w, b in self.actor.layers(run)]
+    weight, bias = layers[-1]
+    last = torch.cat([weight, weight], 1), torch.cat([bias + 0.5, bias - 1])
+    return PolicyParts("gaussian", [*layers[:-1], last])
+
+
+def test_a_gaussian_policy_is_scaled_to_the_bounds_as_the_others_are(medium: str) -> None:
+    """Inverted-pendulum takes actions from -3 to 3."""
+    config = load_algorithm("td3_bc").Config(hidden=(8, 8))
+    schedule = TrainingSchedule((0,), 10, 10, 1)
+    kind = own(policy=gaussian)
+    ((spec,),) = specs_of(kind, {"hidden": (8, 8)}, [medium], schedule, Path("runs"))
+    stack = Stack(kind, [replace(spec, config=config)], load_datasets([spec]), "cpu")
+    observations, noise = np.zeros((3, 4)), np.array([[0.0], [1.0], [5.0]])
+    policy, normalized = stack.policy(0), stack.normalized_policy(0)
+    wanted = [0.5, 0.5 + math.exp(-1), 1.0]
+    np.testing.assert_allclose(normalized.act(observations, noise)[:, 0], wanted, rtol=1e-6)
+    np.testing.assert_allclose(policy.act(observations, noise)[:, 0], 3 * np.array(wanted), rtol=1e-6)
+    np.testing.assert_allclose(policy.act(observations, None), 1.5, rtol=1e-6)
+
+
+def test_an_algorithm_that_calls_exit_is_an_error(medium: str) -> None:
+    kind = own(update=lambda self: exec("raise SystemExit"))
+    with pytest.raises(OffbenchError, match="SystemExit"):
+        offbench.train(kind, medium, steps=10, eval_every=10, eval_episodes=1, hidden=(8,))

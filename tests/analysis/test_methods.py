@@ -113,3 +113,16 @@ def test_the_variants_of_a_sweep_are_ordered_by_their_numbers() -> None:
     ]
     methods = named(*order[::-1])
     assert [method.variant for method in sorted(methods, key=method_order)] == [variant for _, variant, _ in order]
+
+
+def test_names_as_tables_print_them_are_found() -> None:
+    variants = (("bc", "hidden=8x8", None), ("bc", "hidden=9x9", None), ("td3_bc", "default", None))
+    methods = named(*variants, labels=("short (1,000 steps)", "my  bc"))
+    for name in (
+        "short (1,000 steps)",
+        "my  bc",
+        "my bc",
+        "my bc (steps differ)",
+        "td3_bc (300,000 of 1,000,000 steps)",
+    ):
+        assert find_method(methods, name).label.split()[0] == name.split()[0]

@@ -91,6 +91,7 @@ def test_paired_weighs_tasks_equally() -> None:
     found = paired({"one": [4.0, 4.0, 4.0, 4.0], "two": [1.0, 1.0]})
     assert found.difference == Estimate(2.5, 2.5, 2.5)
     assert found.p == 2 / 64  # all six of one sign, or all of the other
+    assert paired({"x": [1e-13, 2e-13, 3e-13, 2e-13, 1e-13, 2e-13]}).p == 2 / 64  # in any unit
 
 
 def test_a_difference_that_does_not_vary_is_not_standardized() -> None:

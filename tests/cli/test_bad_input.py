@@ -238,6 +238,10 @@ RECIPES: dict[str, tuple[str, str]] = {
     "not TOML": ("env_id = ", "not a readable TOML file"),
     "table": ('env_id = "Hopper-v5"\nsac = 3', "sac must be a table"),
     "name": ('env_id = "Hopper-v5"\nname = "../x"', "name must begin with a letter or digit"),
+    "other references": (
+        'env_id = "Hopper-v5"\nd4rl_min = 0.0\nd4rl_max = 1000.0',
+        "d4rl_min and d4rl_max of Hopper-v5 are -20.272305 and 3234.3 in D4RL",
+    ),
     "half a reference": ('env_id = "Hopper-v5"\nd4rl_min = 1.0', "both d4rl_min and d4rl_max"),
     "segment": ('env_id = "Hopper-v5"\n[sac]\nsegment = 30\nenvs = 4', "segment must be a multiple of 4"),
     "nothing to learn in": (

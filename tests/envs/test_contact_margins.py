@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 from offbench.envs import physics
-from offbench.envs.contact_margins import GAP_OUTSIDE_SINCE, SUMMED_SINCE, release, rotations_changed, set_contacts
+from offbench.envs.contact_margins import (
+    GAP_OUTSIDE_SINCE,
+    SUMMED_SINCE,
+    _colliding,
+    release,
+    rotations_changed,
+    set_contacts,
+)
 from offbench.envs.margin_rule import MAX_RULE, SUM_RULE
 from offbench.envs.recipes import load_recipe
 from tests.conftest import ROOT
@@ -163,3 +170,27 @@ def test_only_a_rotating_environment_warns_of_another_physics(
     said = capsys.readouterr().err
     assert all(word in said for word in ("the ant's data", "3.4.0", "4.0.0"))
     assert not rotations_changed(boxes([0.0]))  # Euler's integrator
+
+
+# bodies that overlap: a chain with a welded one and an exclusion, and a child of one that is welded to the world
+CHAIN = """
+<mujoco><option><flag filterparent="{0}"/></option><worldbody><geom name="floor" type="plane" size="1 1 1"/>
+<body name="base"><geom name="base" size=".1"/><body><joint/><geom name="child of the world" size=".1"/></body></body>
+<body name="a"><joint/><geom name="a" size=".1"/>
+  <body name="b"><joint/><geom name="b" size=".1"/><body><geom name="welded to b" size=".1"/>
+    <body name="c"><joint/><geom name="c" size=".1"/>
+      <body name="d"><joint/><geom name="d" size=".1"/><geom name="other type" size=".1" contype="2" conaffinity="4"/>
+</body></body></body></body></body></worldbody>
+<contact><exclude body1="d" body2="a"/></contact></mujoco>
+"""
+
+
+@pytest.mark.parametrize("flag", ["enable", "disable"])
+def test_the_pairs_that_collide_are_those_that_mujoco_finds(flag: str) -> None:
+    model = mujoco.MjModel.from_xml_string(CHAIN.format(flag))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    found = {tuple(sorted(pair)) for pair in data.contact.geom.tolist()}
+    ours = set(zip(*(side.tolist() for side in _colliding(model)), strict=True))
+    assert ours == found
+    assert len(found) > 8

@@ -16,7 +16,7 @@ import offbench
 from offbench.analysis.results import read_results
 from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError
-from offbench.envs.environment_code import environment_code
+from offbench.envs.environment_code import _files, environment_code
 from offbench.envs.environments import env_spec
 from offbench.envs.model_files import loaded_files
 from offbench.training.run import Run
@@ -70,6 +70,14 @@ def test_what_is_hashed(home: Path, recipe: Path) -> None:
     edit(home, "gains.py", "GAIN = 2.0\n")
     after = environment_code(env_spec("pushed:Pushed-v0"))
     assert [name for name in before if before[name] != after[name]] == ["gains.py"]
+
+
+def test_a_word_among_the_arguments_is_no_file(home: Path) -> None:
+    """Whatever the current folder holds."""
+    for name in ("float32", "scene.xml"):
+        (home / name).write_text("a file")
+    found = list(_files("", {"dtype": "float32", "files": ["scene.xml", "./float32"]}))
+    assert found == [("files.0", "scene.xml"), ("files.1", "./float32")]
 
 
 def test_a_model_that_an_argument_names_is_hashed(home: Path) -> None:

@@ -43,7 +43,7 @@ class Steps(gym.Env[Any, Any]):
     observation: Any = np.zeros(3, np.float32)
     reward: Any = 1.0
     ends = True
-    fails = False
+    fails = exits = False
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         return np.zeros(3, np.float32), {}
@@ -51,6 +51,8 @@ class Steps(gym.Env[Any, Any]):
     def step(self, action: Any) -> Any:
         if self.fails:
             raise KeyError("torque")
+        if self.exits:
+            sys.exit()
         return self.observation, self.reward, self.ends, False, {}
 
 
@@ -254,6 +256,7 @@ def test_an_environment_that_fails_is_named(steps: str, monkeypatch: pytest.Monk
         ({"observation": np.zeros(4)}, r"shape \(4,\), its space \(3,\)"),
         ({"observation": "abc"}, r"shape \(\), its space \(3,\)"),
         ({"fails": True}, "KeyError: 'torque'"),
+        ({"exits": True}, "SystemExit"),
     ],
 )
 def test_numbers_that_are_none_are_neither_recorded_nor_learned_from(

@@ -12,7 +12,9 @@ import pytest
 import offbench
 from offbench.benchmarks.grid import load_grid
 from offbench.cli.main import main
+from offbench.envs.environments import env_spec
 from offbench.rollouts.policy import Policy, uniform_policy
+from offbench.rollouts.rollouts import Rollouts, gather
 from offbench.training.run import Run
 
 SMALL: dict[str, Any] = {
@@ -72,6 +74,10 @@ def test_policies_that_choose_at_random_need_no_noise_either() -> None:
     actions = policy(np.zeros((1000, 3)))
     assert ((actions >= low) & (actions <= high)).all()
     assert np.abs(actions.mean(0) - [0, 2.5]).max() < 0.3
+    with Rollouts(env_spec("InvertedPendulum-v5")) as rollouts:  # an evaluation plays the same
+        pendulum = uniform_policy(np.full(1, -3, np.float32), np.full(1, 3, np.float32), 4, "x")
+        results = [rollouts.start_evaluation(pendulum, 0, (), 5, best) for best in (True, False)]
+        assert gather(results[0]) == gather(results[1])
     zeros = np.zeros(3, np.float32)
     layers = ((np.zeros((3, 4), np.float32), np.array([0, 0, -1, -1], np.float32)),)
     gaussian = Policy("squashed_gaussian", layers, zeros, zeros + 1, -high - 1, high + 1, "x")

@@ -19,7 +19,7 @@ from offbench.analysis import normalize
 from offbench.cli.main import main
 from offbench.common import files
 from offbench.common.errors import DamagedError, OffbenchError
-from offbench.common.text import no_formula, printable
+from offbench.common.text import printable
 from offbench.data import transitions
 from offbench.training import registry
 from offbench.training.run import Run, find_runs
@@ -180,13 +180,6 @@ def test_no_cell_is_a_formula(cell: str) -> None:
     text = normalize.render([{"dataset": cell, "return": -1.5}], "csv")
     header, row = csv.reader(io.StringIO(text))
     assert (header, row) == (["dataset", "return"], ["'" + cell, "-1.5"])
-
-
-@pytest.mark.parametrize(
-    "cell", ["-1.5", "-1e-05", "-inf", "-287.1 to 10,964.8", "-1.2 ± 3.0 (50,000 of 1,000,000 steps)"]
-)
-def test_a_negative_number_is_no_formula(cell: str) -> None:
-    assert no_formula(cell) == cell
 
 
 def test_a_fifo_is_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
