@@ -36,12 +36,8 @@ _UNREPEATABLE = {
     torch.Tag.data_dependent_output,  # .item()
     torch.Tag.dynamic_output_shape,  # nonzero()
 }
-_READ_BY_PYTHON = {
-    "tolist",
-    "numpy",
-    "__array__",
-    "__dlpack__",
-}  # methods of Tensor below which no operation is called
+# methods of a tensor that read it without calling an operation
+_READ_BY_PYTHON = {"tolist", "numpy", "__array__", "__dlpack__"}
 _CONSTANTS = ("zeros", "ones", "full", "zeros_like", "ones_like", "full_like", "scalar_tensor")
 _ACTIVE = threading.local()
 

@@ -213,12 +213,13 @@ class _IgnoreWriteErrors(_Stream):
 
 @contextlib.contextmanager
 def _ignored_write_errors() -> Iterator[None]:
-    with _reader_left():
-        try:
+    try:
+        with _reader_left():
             yield
-        except OSError as error:
-            if isinstance(error, BrokenPipeError):
-                raise
+    except _ReaderLeftError:
+        raise
+    except OSError:
+        pass
 
 
 @contextlib.contextmanager
