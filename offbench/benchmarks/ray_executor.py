@@ -50,7 +50,7 @@ SLICE = 600.0  # seconds that a task trains before it returns
 RETRIES = 5  # times that Ray runs a lost task again
 TIMEOUT = 5.0  # seconds to wait for a cluster
 POLL = 1.0  # seconds between two checks of the tasks
-LOCKED = 30.0  # seconds that a task tries again while another process holds a run or a dataset
+LOCKED_TIMEOUT = 30.0  # seconds that a task tries again while another process holds a run or a dataset
 LEFT_OUT = (".lock", ".holder", ".tmp")  # endings of files that belong to one process
 
 Files = dict[str, bytes]
@@ -348,7 +348,7 @@ def _task(work: Callable[[], list[str]], title: str) -> tuple[bool, list[str]]:
         try:
             return True, work()
         except LockedError as error:  # perhaps by a process of a lost node, which ends soon
-            if time.monotonic() - began > LOCKED:
+            if time.monotonic() - began > LOCKED_TIMEOUT:
                 return False, [f"{title}: {error}"]
         except OffbenchError as error:
             return False, [f"{title}: {error}"]

@@ -185,14 +185,13 @@ def verify_arguments(parser: Parser, _: list[str]) -> None:
     parser.add_argument("--json", action="store_true", dest="as_json", help="print JSON")
     add_trust_flag(parser)
 
-    def run(as_json: bool, **arguments: Any) -> None:
+    def run(as_json: bool, **arguments: Any) -> int:
         report = offbench.verify(**arguments)
         if as_json:
             print(report.to_json())
         else:
             print_lines(report.lines())
-        if not report.ok:
-            sys.exit(1)
+        return 0 if report.ok else 1
 
     parser.set_defaults(run=run)
 

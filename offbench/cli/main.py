@@ -351,12 +351,17 @@ def _run(words: list[str]) -> None:
     if arguments.pop("command") is None:
         parser.print_help()
         return
-    run: Callable[..., None] = arguments.pop("run")
+    run: Callable[..., int | None] = arguments.pop("run")
     if arguments.pop("trust", False):
         from offbench.envs.trust import trusting
 
         run = trusting()(run)
-    run(**arguments)
+    try:
+        exit_code = run(**arguments)
+    except SystemExit as error:
+        raise OffbenchError(f"an environment, a policy or an algorithm called sys.exit({error.code!r})") from error
+    if exit_code:
+        sys.exit(exit_code)
 
 
 def _complete() -> NoReturn:

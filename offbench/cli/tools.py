@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict
 from json import dumps
 
@@ -17,7 +16,7 @@ def doctor_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `doctor`."""
     parser.add_argument("--json", action="store_true", help="print JSON")
 
-    def run(json: bool) -> None:
+    def run(json: bool) -> int:
         from offbench.tools.doctor import BROKEN, OK
 
         findings = offbench.doctor()
@@ -27,7 +26,7 @@ def doctor_arguments(parser: Parser, _: list[str]) -> None:
             rows = [[finding.name, finding.state, finding.text] for finding in findings]
             not_ok = {(i, 1) for i, finding in enumerate(findings) if finding.state != OK}
             print_table(["check", "state", "details"], rows, names=3, marked=not_ok)
-        sys.exit(any(finding.state == BROKEN for finding in findings))
+        return int(any(finding.state == BROKEN for finding in findings))
 
     parser.set_defaults(run=run)
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 FORMATS = ("png", "svg", "pdf")
 
 
-def default_style(settings: Any = None) -> AbstractContextManager[None]:
+def default_style(settings: dict[str, Any] | None = None) -> AbstractContextManager[None]:
     """Return a context with matplotlib's default style, not the user's, and some settings of matplotlibrc."""
     from matplotlib.style import context
 

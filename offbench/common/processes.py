@@ -130,15 +130,15 @@ def closing() -> bool:
     return _Worker.closing is not None and bool(_Worker.closing.value)
 
 
-def _lives(parent: int) -> bool:
+def _parent_is_alive(parent: int) -> bool:
     """Return whether the parent of this process lives; on Windows, getppid still returns it after its end."""
     process = multiprocessing.parent_process()
     return os.getppid() == parent and (process is None or process.is_alive())
 
 
 def _watch(parent: int) -> None:
-    while _lives(parent) and not closing():
+    while _parent_is_alive(parent) and not closing():
         time.sleep(1.0)
-    if _lives(parent):
+    if _parent_is_alive(parent):
         time.sleep(GRACE)  # the pool ends its workers itself, unless one of them was killed
     os._exit(1)

@@ -312,7 +312,7 @@ def _draw(
     return Figure(name, caption, alt, png, svg, _for_page(inline, name), tuple(legend))
 
 
-def _rc_params(name: str) -> Any:
+def _rc_params(name: str) -> dict[str, Any]:
     """Return matplotlib's settings: a $ in a name is no formula, and the ids in an SVG are always the same."""
     return {
         "text.parse_math": False,

@@ -233,3 +233,14 @@ def test_only_the_end_of_the_reader_ends_a_command_quietly(
         main(["normalize"])
     assert end.value.code == 2
     assert "Broken pipe" in capsys.readouterr().err
+
+
+def test_a_users_code_that_exits_ends_no_command_quietly(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Wherever it is called: environments, policies and algorithms that fail in known places are named."""
+    monkeypatch.setattr("offbench.normalize", lambda **_: sys.exit(0))
+    with pytest.raises(SystemExit) as end:
+        main(["normalize"])
+    assert end.value.code == 2
+    assert "an environment, a policy or an algorithm called sys.exit(0)" in capsys.readouterr().err

@@ -38,10 +38,10 @@ def test_a_title_some_datasets_and_some_methods(home: Path) -> None:
     assert [row["level"] for row in table] == ["medium", "expert"]
     assert list(table[0])[2:] == ["td3_bc (30,000 steps)", "bdb (beta=0.5) (30,000 steps)"]
     assert "cql" not in page.text
-    written = (home / "out" / "tables" / "scores.csv").read_bytes()
     offbench.report("runs", "one", datasets="x-*", methods="td3_bc")  # one text is one name
-    assert list(rows(home / "one" / "tables" / "scores.csv")[0])[2:] == ["td3_bc (30,000 steps)"]
-    assert len(written.splitlines()) == len((home / "one" / "tables" / "scores.csv").read_bytes().splitlines())
+    table = rows(home / "one" / "tables" / "scores.csv")
+    assert [row["level"] for row in table] == ["medium", "expert"]
+    assert list(table[0])[2:] == ["td3_bc (30,000 steps)"]
     with pytest.raises(OffbenchError, match="unknown dataset 'z-\\*': available: x-expert-v0"):
         offbench.report("runs", "out", datasets=["z-*"])
     with pytest.raises(OffbenchError, match="bc has no evaluated runs here"):
