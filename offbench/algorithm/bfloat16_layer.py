@@ -21,13 +21,15 @@ class Bfloat16Layer:
     def __init__(self, h: Array, weight: Array, out: Array, keep: bool) -> None:
         self._h, self._weight, self._out = map(torch.from_numpy, (h, weight, out))
         batch, (rows, columns) = len(h), weight.shape
-        self._bf16_h = (_bf16_buffer if keep else shared("inputs", _bf16_buffer))(batch, rows)
-        self._bf16_weight = (_bf16_buffer if keep else shared("weights", _bf16_buffer))(rows, columns)
-        self._bf16_out = shared("product", _bf16_buffer)(batch, columns)
         if keep:
-            self._bf16_grad = shared("gradient", _bf16_buffer)(batch, columns)
-            self._bf16_grad_weight = shared("product", _bf16_buffer)(rows, columns)
-            self._bf16_grad_h = shared("product", _bf16_buffer)(batch, rows - 1)
+            self._bf16_h, self._bf16_weight = _bf16_buffer(batch, rows), _bf16_buffer(rows, columns)
+            self._bf16_grad = shared("gradient", _bf16_buffer, batch, columns)
+            self._bf16_grad_weight = shared("product", _bf16_buffer, rows, columns)
+            self._bf16_grad_h = shared("product", _bf16_buffer, batch, rows - 1)
+        else:
+            self._bf16_h = shared("inputs", _bf16_buffer, batch, rows)
+            self._bf16_weight = shared("weights", _bf16_buffer, rows, columns)
+        self._bf16_out = shared("product", _bf16_buffer, batch, columns)
 
     def forward(self) -> None:
         """Compute `out`."""

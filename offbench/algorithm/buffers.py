@@ -34,14 +34,10 @@ def rows_with_ones(batch: int, width: int) -> Array:
 _BUFFERS = threading.local()
 
 
-def shared(use: str, make: Callable[[int, int], Buffer]) -> Callable[[int, int], Buffer]:
-    """Return a version of `make` whose arrays are shared by all passes of this thread, for values of a single pass."""
-
-    def make_once(batch: int, width: int) -> Buffer:
-        arrays: dict[object, Buffer] = _BUFFERS.__dict__.setdefault("arrays", {})
-        key = (use, make, batch, width)
-        if key not in arrays:
-            arrays[key] = make(batch, width)
-        return arrays[key]
-
-    return make_once
+def shared(use: str, make: Callable[[int, int], Buffer], batch: int, width: int) -> Buffer:
+    """Return `make(batch, width)`, made once and shared by all passes of this thread, for values of a single pass."""
+    arrays: dict[object, Buffer] = _BUFFERS.__dict__.setdefault("arrays", {})
+    key = (use, make, batch, width)
+    if key not in arrays:
+        arrays[key] = make(batch, width)
+    return arrays[key]

@@ -5,13 +5,14 @@ reads and writes, and replayed with them. Views are made once, outputs stay in p
 same kernels run in the same order on the same numbers, so a replayed update has the bits of an eager one.
 
 An update can be replayed if it always does the same operations: it may not read numbers into Python, draw random
-numbers, or depend on anything but tensors that changes. `record` notices the first two, comparing records and
-`attributes` the third.
+numbers, or depend on anything but tensors that changes. `trace` detects the first two; comparing traces, and
+`attributes`, detects the third.
 """
 
 from __future__ import annotations
 
 import collections
+import random
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -51,15 +52,15 @@ class Trace:
 
     Attributes:
         calls: what a replay calls, in order.
-        key: what was recorded, comparable between two records of the same update.
-        outside: tensors that were there before the record, in order of their first use.
+        key: what was recorded, comparable between two traces of the same update.
+        outside: tensors that were there before the trace, in order of their first use.
     """
 
     def __init__(self) -> None:
         self.calls: list[Call] = []
         self.key: list[tuple[object, Nested]] = []
         self.outside: list[Tensor] = []
-        self._kept: list[Nested] = []  # no storage of the record is freed and used again
+        self._kept: list[Nested] = []  # no storage of the trace is freed and used again
         # by a storage's address: the call that allocated it or `outside`, and the call that fills it with constants
         self._origins: dict[int, tuple[str, int]] = {}
         self._constants: dict[int, int] = {}
@@ -70,7 +71,7 @@ class Trace:
             call()
 
     def same_as(self, other: Trace) -> bool:
-        """Return whether two records do the same with the same numbers."""
+        """Return whether two traces do the same with the same numbers."""
         return (
             self.key == other.key
             and len(self.outside) == len(other.outside)
@@ -107,7 +108,7 @@ class Trace:
         self.calls = [call for index, call in enumerate(self.calls) if index not in left_out]
 
     def keep(self, tensors: Nested) -> None:
-        """Keep tensors alive as long as this record."""
+        """Keep tensors alive as long as this trace."""
         self._kept.append(tensors)
 
     def _describe(self, tensor: Tensor) -> tuple[object, ...]:
@@ -170,7 +171,7 @@ class _Tracer(TorchDispatchMode):  # type: ignore[no-untyped-call]
         if _UNREPEATABLE & set(func.tags):
             what = f"calls {func}"
             if torch.Tag.nondeterministic_seeded in func.tags:
-                what = f"draws random numbers by {func}, which a resumed run would not repeat; use noise_spec"
+                what = f"draws random numbers by {func}"
             self.problem = self.problem or f"it {what}"
         elif func._schema.is_mutable:
             self.trace.changed((args, kwargs))
@@ -200,15 +201,16 @@ class _Reads(TorchFunctionMode):
 def attributes(owner: object, *, in_place: bool = False) -> dict[str, object]:
     """Return the attributes of an object, to be compared with a later state by `changed_attribute`.
 
-    Numbers, texts and the contents of lists, dicts, sets and plain objects count by value, anything else by identity.
-    What a checkpoint keeps does not count.
+    Numbers, texts, generators of random numbers and the contents of lists, dicts, sets and plain objects count by
+    value, anything else by identity. What a checkpoint keeps does not count.
 
     Args:
         in_place: whether changes in place of other tensors count, which a replay repeats.
     """
-    learned: dict[str, Any] = getattr(owner, "learned", {}) if in_place else {}
-    kept = {_memory(tensor) for part in learned.values() for tensor in part.tensors().values()}
-    return {name: _state(value, frozenset(), kept if in_place else None) for name, value in vars(owner).items()}
+    learned: dict[str, Any] = getattr(owner, "learned", {})
+    kept = {_memory(tensor) for part in learned.values() for tensor in part.tensors().values()} if in_place else None
+    by_identity = frozenset(map(id, learned.values()))
+    return {name: _state(value, by_identity, kept) for name, value in vars(owner).items()}
 
 
 def changed_attribute(before: dict[str, object], after: dict[str, object], *, first: bool) -> str | None:
@@ -228,11 +230,11 @@ def _memory(tensor: Tensor) -> int:
     return tensor.untyped_storage().data_ptr()
 
 
-def _state(value: object, above: frozenset[int], kept: set[int] | None) -> object:
+def _state(value: object, by_identity: frozenset[int], kept: set[int] | None) -> object:
     """Return the parts of a value that can change, in a form that can be compared.
 
     Args:
-        above: ids of what the value is part of.
+        by_identity: ids of objects that count by identity: what a checkpoint keeps, and what the value is part of.
         kept: addresses of tensors that a checkpoint keeps, if changes of others in place count.
     """
     if isinstance(value, Tensor):
@@ -240,9 +242,9 @@ def _state(value: object, above: frozenset[int], kept: set[int] | None) -> objec
         return id(value), 0 if ignored else value._version
     if value is None or isinstance(value, bool | int | float | complex | str | bytes):
         return type(value).__name__, repr(value)  # repr, so that NaN compares equal
-    if id(value) in above or isinstance(value, type) or callable(getattr(value, "tensors", None)):
+    if id(value) in by_identity or isinstance(value, type):
         return id(value)
-    inner = above | {id(value)}
+    inner = by_identity | {id(value)}
     if isinstance(value, dict):
         return [(repr(key), _state(item, inner, kept)) for key, item in value.items()]
     if isinstance(value, list | tuple | collections.deque):
@@ -251,6 +253,12 @@ def _state(value: object, above: frozenset[int], kept: set[int] | None) -> objec
         return sorted(map(repr, value))
     if isinstance(value, np.ndarray):
         return value.shape, str(value.dtype), value.tobytes()
+    if isinstance(value, torch.Generator):
+        return id(value), value.get_state().numpy().tobytes()
+    if isinstance(value, np.random.Generator):
+        return id(value), repr(value.bit_generator.state)
+    if isinstance(value, random.Random):
+        return id(value), value.getstate()
     if hasattr(value, "__dict__"):
         return id(value), [(name, _state(item, inner, kept)) for name, item in vars(value).items()]
     return id(value), repr(value)

@@ -109,7 +109,9 @@ class Algorithm(Generic[C]):
 
     Args:
         config: what `stack_configs` returns for the runs' Configs: each setting that is `per_run` is a tensor [runs].
+        observation_dim, action_dim: widths of observations and actions.
         run_seeds: one seed for each run.
+        device: where the networks are, and all tensors of an update.
 
     Attributes:
         capture: whether updates may be recorded and replayed, which is faster. A replay repeats only tensor
@@ -172,6 +174,10 @@ class Algorithm(Generic[C]):
         """Return Q(s, a) [runs, batch] for the similar score, None if the algorithm has no critic.
 
         By default that of the network `critic`, the first of an ensemble.
+
+        Args:
+            observations: [runs, batch, obs], normalized if the settings say so.
+            actions: [runs, batch, act] in [-1, 1].
         """
         critic = getattr(self, "critic", None)
         return critic.frozen(observations, actions, members=0) if isinstance(critic, Network) else None
@@ -260,13 +266,13 @@ def check_logs(logs: object, runs: int, where: str) -> None:
 
 
 def check_noise_spec(spec: object, where: str) -> None:
-    """Raise OffbenchError unless a noise_spec has a distribution, with a shape of whole numbers, for each name."""
+    """Raise OffbenchError unless a noise_spec has a known distribution, with a valid shape, for each name."""
     if not isinstance(spec, Mapping):
         raise OffbenchError(f"{where} must return a dict, not a {type(spec).__name__}")
     for name, distribution in spec.items():
-        shape = distribution.shape if isinstance(distribution, Distribution) else (None,)
-        if not all(isinstance(size, Integral) for size in shape):
-            wanted = "normal(*shape) or uniform(*shape) of whole numbers"
+        known = isinstance(distribution, Distribution) and distribution.name in ("normal", "uniform")
+        if not known or not all(isinstance(size, Integral) and int(size) >= 0 for size in distribution.shape):
+            wanted = "normal(*shape) or uniform(*shape) with sizes from 0"
             raise OffbenchError(f"{where}: {name!r} must be {wanted}, not {distribution!r:.80}")
 
 

@@ -149,8 +149,10 @@ class ForwardPass:
         for member, run in itertools.product(range(ensemble), range(runs)):
             h, self.layer_inputs[member, run] = x[run], [x[run]]
             for layer, width in enumerate(sizes[1:-1]):
-                allocate = rows_with_ones if keep else shared(f"layer {layer}", rows_with_ones)
-                layer_output = allocate(batch, width)
+                if keep:
+                    layer_output = rows_with_ones(batch, width)
+                else:
+                    layer_output = shared(f"layer {layer}", rows_with_ones, batch, width)
                 weight = self.layers[layer][member, run]
                 if bf16 and min(sizes[layer], width) >= NARROW:
                     bf16_layer = Bfloat16Layer(h, weight, layer_output[:, :-1], keep)
@@ -209,7 +211,7 @@ class BackwardPass:
                     else:
                         self.calls.append(partial(bf16_layer.grad_weight, torch.from_numpy(grad_layer)))
                 if layer:
-                    before = shared(f"gradient {layer % 2}", rows)(batch, sizes[layer])
+                    before = shared(f"gradient {layer % 2}", rows, batch, sizes[layer])
                     if bf16_layer is None:
                         self._product(g, weight.T, before)
                     else:
@@ -224,7 +226,7 @@ class BackwardPass:
                         if member == 0:
                             self._product(g, part, grad_input)
                         else:
-                            other = shared("gradient of an input", rows)(batch, width)
+                            other = shared("gradient of an input", rows, batch, width)
                             self._product(g, part, other)
                             self.calls.append(partial(np.add, grad_input, other, grad_input))
                     start += width

@@ -53,6 +53,7 @@ class Parameters:
     """A flat tensor [ensemble, runs, P] that Adam moves. Runs are axis 1, in every tensor of `tensors()`.
 
     Args:
+        flat: the initial values, [ensemble, runs, P].
         learning_rate: Adam's; a number, or a function of the number of earlier steps (`cosine_decay`).
         weight_decay: decoupled weight decay of all parameters, as in AdamW.
         scalar: whether `value` is without its last axis.
@@ -110,7 +111,16 @@ class Parameters:
 
 
 def minimize(loss: Tensor, *parts: Parameters, retain_graph: bool = False) -> None:
-    """Take one Adam step of each part down the gradient of `loss` [runs]; all gradients come before the steps."""
+    """Take one Adam step of each part down the gradient of `loss`; all gradients come before the steps.
+
+    Args:
+        loss: one number for each run, [runs].
+        parts: what is moved.
+        retain_graph: as in `torch.autograd.grad`: keep the graph for another gradient.
+
+    Raises:
+        OffbenchError: `loss` has another shape.
+    """
     if loss.shape != (runs := parts[0].flat.shape[1],):
         raise OffbenchError(
             f"a loss is one number for each run, [runs] = [{runs}], not {list(loss.shape)}: reduce the other axes"
@@ -129,10 +139,12 @@ class Network(Parameters):
         outputs: width of the outputs; None for a single number without an axis of its own.
         run_seeds: one seed for each run; a run's weights depend only on its seed and on `index`.
         index: the network's number among those of an algorithm.
+        learning_rate, weight_decay: as in `Parameters`.
         ensemble_size: MLPs for each run; None for a single one without an ensemble axis.
         activation: activation of the hidden layers, relu or tanh.
-        norm: LayerNorm in the hidden layers, before or after the activation.
+        norm: LayerNorm in the hidden layers, "before" or "after" the activation, or "none".
         twice_differentiable: whether gradients of gradients are needed (a gradient penalty); costs more on a CPU.
+        device: where the parameters are.
     """
 
     def __init__(
@@ -183,11 +195,12 @@ class Network(Parameters):
         """Return the outputs as a call does, without gradients of the weights.
 
         Args:
+            inputs: each [runs, batch, dim].
             members: index of one member (drops the ensemble axis), or a slice.
         """
         if isinstance(members, slice):
             return self.forward(self.flat.detach()[members], *inputs)
-        outputs = self.forward(self.flat.detach()[members : members + 1], *inputs)
+        outputs = self.forward(self.flat.detach()[members].unsqueeze(0), *inputs)
         return outputs if 0 in self._squeezed else outputs.squeeze(0)
 
     def forward(self, flat: Tensor, *inputs: Tensor) -> Tensor:

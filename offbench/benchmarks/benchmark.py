@@ -94,7 +94,7 @@ def _seconds(budget: str | float) -> float:
     """Return the seconds of `9m`, `1.5h`, `90s` or a number."""
     try:
         value = float(budget[:-1]) * UNITS[budget[-1]] if isinstance(budget, str) else float(budget)
-    except (ValueError, KeyError, IndexError):
+    except (ValueError, TypeError, KeyError, IndexError):
         raise OffbenchError(f"a budget is a time like 9m, 1.5h or 90s, not {budget!r}") from None
     if not 0 < value < float("inf"):
         raise OffbenchError(f"a budget must be positive, not {budget!r}")

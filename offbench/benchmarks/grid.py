@@ -124,7 +124,8 @@ def _schedule(values: JsonObject, default: TrainingSchedule, where: str) -> Trai
     bad = not isinstance(seeds, Sequence) or any(type(s) is not int or not 0 <= s <= MAX_INT for s in seeds)
     if bad or len(set(seeds)) != len(seeds) or not len(seeds):
         raise OffbenchError(
-            f"{where}: seeds must be a count or a list of different whole numbers, not {short_repr(seeds)}"
+            f"{where}: seeds must be a count up to {MAX_SEEDS:,} or a list of different whole numbers, not "
+            f"{short_repr(seeds)}"
         )
     return build(TrainingSchedule, merged | {"seeds": tuple(seeds)}, where)
 

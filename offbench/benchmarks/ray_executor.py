@@ -34,7 +34,7 @@ from offbench.benchmarks.datasets import record_dataset
 from offbench.benchmarks.grid import GridDataset
 from offbench.common.errors import LockedError, OffbenchError
 from offbench.common.files import write_bytes
-from offbench.common.processes import environment
+from offbench.common.processes import MAX_WORKERS, cores, environment
 from offbench.data import minari_store
 from offbench.training.claim import by_common_step, check_algorithm_code
 from offbench.training.jobs import JobProgress, raise_first, train_job
@@ -96,8 +96,8 @@ class RayExecutor:
 
     @property
     def cpus(self) -> int:
-        """The cluster's processors."""
-        return int(self.ray.cluster_resources().get("CPU", 1))
+        """The cluster's processors, at most as many as there may be workers."""
+        return min(int(self.ray.cluster_resources().get("CPU", 1)), MAX_WORKERS)
 
     def record(self, datasets: Sequence[GridDataset], workers: int, deadline: float | None = None) -> None:
         """Record datasets, a task each, none after the deadline. Raises OffbenchError for the first that failed."""
@@ -113,6 +113,7 @@ class RayExecutor:
         for name in {job.first.algorithm for job in jobs}:
             self._send_code(name)
         waiting, active, problems = list(range(len(jobs))), dict["ObjectRef", int](), list[str]()
+        self.ray.get(self.server.clear.remote())
         with JobProgress(jobs) as progress, _driver(common) as driver:
             while waiting or active:
                 for index in waiting:
@@ -192,6 +193,10 @@ class FileServer:
         write_folder(temporary, files)
         if not target.exists():
             temporary.replace(target)
+
+    def clear(self) -> None:
+        """Forget the progress of an earlier call."""
+        self.latest.clear()
 
     def report(self, index: int, step: int, note: str) -> None:
         """Keep the latest step and note of a job."""
@@ -280,7 +285,8 @@ def _train(
     if own is not None:
         register(own)
     slice_end = time.time() + seconds
-    job = replace(job, deadline=slice_end if job.deadline is None else min(job.deadline, slice_end))
+    deadline = slice_end if job.deadline is None else min(job.deadline, slice_end)
+    job = replace(job, deadline=deadline, workers=min(job.workers, cores()))  # the driver counts the cluster's cores
 
     def report(step: int, note: str) -> None:
         server.report.remote(index, step, note)

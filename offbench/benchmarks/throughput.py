@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 SECONDS = 0.5  # minimum duration of a measurement
 ROWS = 4096  # random transitions
 ENV_STEPS = 2000
-COUNTED = 4  # updates whose operations are counted: enough to include every phase of an alternating update
+COUNTED = 12  # updates whose operations are counted: a multiple of the usual intervals between actor updates
 
 
 @dataclass(frozen=True)
@@ -47,18 +47,20 @@ class Rate:
 def measure(spec: RunSpec, env_spec: str, device: str) -> Rate:
     """Time the updates of runs like `spec` on random data of an environment's shapes, for half a second or more.
 
-    It is one run on a CPU, and a stack of what fits on a GPU.
+    It is one run on a CPU, and a stack of what fits on a GPU. The updates are those from the middle of the run on, as
+    the first ones may be cheaper.
     """
     with matmul_settings(device, spec.precision):
         runs = 1 if device == "cpu" else stack_size(spec, random_data(env_spec), device)
         stack = random_stack(load_algorithm(spec.algorithm), [spec.config] * runs, env_spec, device)
+        start = stack.step = spec.steps // 2
         updates = 2 * TRACED_UPDATES
         while True:
             began, first = time.perf_counter(), stack.step
             stack.train(first + updates)
             stack.captured_update.logged()  # waits for the device
             spent = time.perf_counter() - began
-            if spent >= SECONDS and first:
+            if spent >= SECONDS and first > start:
                 break
             updates = max(2, min(10 * updates, round(1.2 * SECONDS * updates / spent)))
     size = sum(t.numel() * t.element_size() for t in stack.run_tensors(0).values())
@@ -71,9 +73,10 @@ def operations(spec: RunSpec, env_spec: str) -> float:
 
     stack = random_stack(load_algorithm(spec.algorithm), [spec.config], env_spec)
     stack.captured_update.eager = True
-    stack.train(2 * TRACED_UPDATES)  # past work that is done only once
+    stack.step = spec.steps // 2  # as `measure` does
+    stack.train(stack.step + 2 * TRACED_UPDATES)  # past work that is done only once
     with matmul_backend("pytorch"), FlopCounterMode(display=False) as counter:
-        stack.train(2 * TRACED_UPDATES + COUNTED)
+        stack.train(stack.step + COUNTED)
     return float(counter.get_total_flops()) / COUNTED
 
 

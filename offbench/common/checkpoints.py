@@ -48,7 +48,7 @@ def load_checkpoint(folder: Path, step: int) -> tuple[dict[str, torch.Tensor], J
     """
     path = path_of(folder, step)
     try:
-        with read_errors(str(path), "is damaged", "using the one before it"):
+        with read_errors(str(path), "is damaged", "it is not used"):
             os.close(open_regular(path))  # safe_open would wait for a FIFO
             with safe_open(path, framework="pt") as file:
                 state = json.loads((file.metadata() or {})["offbench"])

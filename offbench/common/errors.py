@@ -19,7 +19,7 @@ class OffbenchError(Exception):
 
 
 class LockedError(OffbenchError):
-    """Another process holds a lock, so that it does this work already."""
+    """Another process holds the lock, so it is doing this work."""
 
 
 class DamagedError(OffbenchError):

@@ -48,7 +48,13 @@ LOCK_TIMEOUT = 3.0  # seconds to wait for a lock: processes whose parent was kil
 def is_out_of_memory(error: BaseException) -> bool:
     """Return whether memory has run out, of this machine or of a GPU."""
     # PyTorch's and NumPy's (the last two are of sizes beyond 64 bits), and the dynamic linker's
-    words = ("can't allocate memory", "out of memory", "failed to map segment", "calculation overflowed", "is too big")
+    words = (
+        "can't allocate memory",
+        "out of memory",
+        "failed to map segment",
+        "calculation overflowed",
+        "array is too big",
+    )
     by_number = isinstance(error, OSError) and error.errno == errno.ENOMEM
     by_text = isinstance(error, RuntimeError | ImportError | ValueError) and any(word in str(error) for word in words)
     return isinstance(error, MemoryError) or by_number or by_text
@@ -163,7 +169,9 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_together(contents: Mapping[Path, bytes]) -> None:
-    """Replace the contents of several files, in this order once all are on the disk, or leave all as they were.
+    """Replace the contents of several files, each whole, in this order once all are written next to them.
+
+    A failure before all are written leaves all as they were; a later one (of a rename) leaves the first ones new.
 
     Raises:
         OffbenchError: as `write_bytes`.

@@ -65,7 +65,7 @@ def default_workers(workers: int | None) -> int:
 
 
 def blocking_workers(workers: int) -> int:
-    """Return the worker processes of a pool that this process only waits for: none instead of a single one."""
+    """Return 0 instead of 1: where this process would only wait, a single worker process gains nothing."""
     return workers if workers > 1 else 0
 
 

@@ -31,6 +31,7 @@ class Purpose(IntEnum):
     WEIGHTS = 7  # initial weights of network i
     CHUNK = 8  # batches and noise of chunk i of a run
     EVALUATION = 9  # the episodes of a run's evaluation at step i
+    # 10 was used by an earlier version
     SAMPLE = 11  # the transitions or episodes of a figure or a check
     BOOTSTRAP = 12  # the resampled seeds of a bootstrap interval
 

@@ -138,12 +138,6 @@ def check(cls: type, name: str, value: object, where: str, *, parse: bool = True
     return value
 
 
-def _default_of(field: Field) -> object:
-    """Return a field's default, dataclasses.MISSING if it has none."""
-    factory = field.default_factory
-    return field.default if factory is dataclasses.MISSING else factory()
-
-
 def check_declarations(cls: type, where: str) -> None:
     """Raise OffbenchError if a settings class has a field of a type that settings cannot have, or a bad default."""
     try:
@@ -158,8 +152,8 @@ def check_declarations(cls: type, where: str) -> None:
         words = str in options and not field.metadata.get("choices")
         if field.metadata.get("per_run") and (words or not {int, float, bool, str}.issuperset(options)):
             raise _error(where, f"the setting {name} is per_run, so it must be a number, or a word of its choices=")
-        if field.init and (default := _default_of(field)) is not dataclasses.MISSING:
-            check(cls, name, default, f"{where}: a default", parse=False)
+        if field.init and field.default is not dataclasses.MISSING:
+            check(cls, name, field.default, f"{where}: a default", parse=False)
 
 
 def without_numpy(value: object) -> Any:

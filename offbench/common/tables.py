@@ -104,7 +104,9 @@ def latex(text: str) -> str:
 
 def tabular(header: Sequence[str], cells: Sequence[Sequence[str]], names: int) -> list[str]:
     """Return the lines of a LaTeX table (booktabs) of escaped text; columns after the first `names` align right."""
-    head, *body = [" & ".join(line) + r" \\" for line in [header, *cells]]
+    lines = [" & ".join(line) + r" \\" for line in [header, *cells]]
+    # after a row, LaTeX would take [...] for an argument
+    head, *body = ["{}" + line if line.startswith("[") else line for line in lines]
     spec = "l" * names + "r" * (len(header) - names)
     top = [f"\\begin{{tabular}}{{{spec}}}", r"\toprule", head, r"\midrule"]
     return [*top, *body, r"\bottomrule", r"\end{tabular}"]

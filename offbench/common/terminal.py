@@ -36,7 +36,10 @@ def console(stream: TextIO) -> Console:
 
     raw = getattr(stream, "raw_stream", stream)
     plain = bool(os.environ.get("NO_COLOR"))  # rich itself would still print bold
-    return Console(file=raw, color_system=None if plain else "auto", highlight=False, markup=False, emoji=False)
+    screen = Console(file=raw, color_system=None if plain else "auto", highlight=False, markup=False, emoji=False)
+    if screen.width < 1:  # with COLUMNS=0
+        screen.width = 80
+    return screen
 
 
 def print_line(line: str, style: str = "") -> None:

@@ -18,7 +18,6 @@ from torch import Tensor
 from offbench.algorithm.interface import NOT_LOADED, Batch, NoiseSpec
 from offbench.common import seeds
 from offbench.common.arrays import Array
-from offbench.common.errors import OffbenchError
 from offbench.common.seeds import Purpose
 from offbench.data.transitions import Transitions
 from offbench.training.spec import RunSpec
@@ -133,8 +132,6 @@ def draw_chunk(
             shape = (CHUNK, *distribution.shape)
             if distribution.name == "normal":
                 noise[name].append(torch.randn(shape, generator=generator, device=device))
-            elif distribution.name == "uniform":
-                noise[name].append(torch.rand(shape, generator=generator, device=device) * 2 - 1)
             else:
-                raise OffbenchError(f"noise_spec: {name!r} must be normal or uniform, not {distribution.name!r}")
+                noise[name].append(torch.rand(shape, generator=generator, device=device) * 2 - 1)
     return torch.stack(indices, 1), {name: torch.stack(parts, 1) for name, parts in noise.items()}

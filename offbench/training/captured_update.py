@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import random
 from collections import Counter
 from collections.abc import Hashable, Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -143,12 +145,17 @@ class CapturedUpdate:
     def _update(self, phase: Hashable) -> None:
         batch = self.store.batch(self.indices.index_select(0, self.position)[0])
         noise = {name: values.index_select(0, self.position)[0] for name, values in self.noise.items()}
-        logs = self.algorithm.update(batch, noise, phase)
         where = f"{type(self.algorithm).__name__}.update"
         if phase not in self._names:
+            before = random_states(self.device)
+            logs = self.algorithm.update(batch, noise, phase)
+            if random_states(self.device) != before:
+                inform(f"{where} draws random numbers that a resumed run would not repeat; use noise_spec")
             check_logs(logs, len(self.store.sizes), where)
             self._names[phase] = list(logs)
-        elif self._names[phase] != list(logs):  # a replay would log those of the first update
+        else:
+            logs = self.algorithm.update(batch, noise, phase)
+        if self._names[phase] != list(logs):  # a replay would log those of the first update
             raise OffbenchError(f"{where} must log the same names at every update of phase {phase!r}")
         for name, value in logs.items():
             if name not in self.sums:
@@ -181,3 +188,9 @@ class CapturedUpdate:
         for name, total, count in sums:
             self.sums.setdefault(name, torch.zeros(len(self.store.sizes), device=self.device))[run] = total
             self.earlier[run][name] = count
+
+
+def random_states(device: torch.device) -> tuple[object, ...]:
+    """Return the states of the generators that are shared by all code."""
+    shared = [torch.get_rng_state()] + ([torch.cuda.get_rng_state(device)] if device.type == "cuda" else [])
+    return [state.numpy().tobytes() for state in shared], random.getstate(), repr(np.random.get_state())

@@ -15,6 +15,7 @@ from offbench.algorithm.mlp import matmul_backend
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import default_workers
 from offbench.common.provenance import has_bfloat16
+from offbench.common.settings import short_repr, without_numpy
 
 PRECISIONS = ("float32", "tf32", "bfloat16")
 
@@ -49,8 +50,9 @@ def pick_machine(device: str, workers: int | None, stack: int | str, precision: 
     Raises:
         OffbenchError: a device that this machine lacks, a precision that the device lacks, or a bad value.
     """
+    stack = without_numpy(stack)
     if stack != "auto" and not (isinstance(stack, int) and stack >= 1):
-        raise OffbenchError(f"stack must be auto or a whole number from 1, not {stack!r}")
+        raise OffbenchError(f"stack must be auto or a whole number from 1, not {short_repr(stack)}")
     device = pick_device(str(device))  # a torch.device too
     check_precision(precision, device)
     return Machine(device, default_workers(workers), stack)

@@ -43,11 +43,15 @@ def describe_failure(error: BaseException, write_traceback: Callable[[str], obje
 
 
 def _third_party(trace: types.TracebackType | None) -> str | None:
-    """Return the package or module of an algorithm, not offbench's own, that a traceback leads through."""
-    packages = algorithm_packages() - {"offbench"}
+    """Return the package or module of an algorithm, not offbench's own, that a traceback leads through.
+
+    A script's or notebook's own frames count once offbench has called them.
+    """
+    packages, in_offbench = algorithm_packages() - {"offbench"}, False
     while trace is not None:
         package = str(trace.tb_frame.f_globals.get("__name__", "")).partition(".")[0]
-        if package in packages:
-            return package
+        in_offbench = in_offbench or package == "offbench"
+        if package in packages or (package == "__main__" and in_offbench):
+            return "your script" if package == "__main__" else package
         trace = trace.tb_next
     return None

@@ -22,7 +22,7 @@ from offbench.training.registry import load_algorithm
 from offbench.training.spec import Job, RunSpec
 from offbench.training.stack import Stack
 
-CPU_STACK = 8  # runs of one process: more gain nothing there, and each waits for all others
+CPU_STACK = 8  # runs of a process: a larger stack is no faster on a CPU, and its runs end together
 MEMORY_SHARE = 0.8  # share of a GPU's free memory that a stack may use
 
 

@@ -41,6 +41,7 @@ RESERVED_SETTINGS = {
     "workers",
 }
 REQUIRED_SETTINGS = {"batch_size": int, "normalize": bool}  # settings that the training itself reads
+TRAINING_SETTINGS = {**REQUIRED_SETTINGS, "top": float}  # and those that it reads if an algorithm has them
 
 
 @functools.cache
@@ -119,6 +120,8 @@ def register(algorithm: str | Path | type) -> str:
     if isinstance(algorithm, str) and not re.search(r"\.py(:|$)", algorithm):
         return algorithm
     cls = _from_file(algorithm) if isinstance(algorithm, str) else algorithm
+    if not isinstance(cls, type):
+        raise OffbenchError(f"an algorithm is a name, a file ./my_algo.py:ReBRAC or a class, not {cls!r:.60}")
     name, value = cls.__name__, f"{cls.__module__}:{cls.__qualname__}"
     for points in _entry_points().values():
         for point in points:
@@ -211,13 +214,15 @@ def _check_algorithm(cls: type, what: str) -> type[Algorithm]:
     for field in dataclasses.fields(config):
         if field.name in RESERVED_SETTINGS:
             raise OffbenchError(f"{what}: the setting {field.name} has the name of an option of training; rename it")
-        if field.init and field.default is field.default_factory is dataclasses.MISSING:
-            raise OffbenchError(f"{what}: the setting {field.name} needs a default")
+        if field.init and field.default is dataclasses.MISSING:
+            raise OffbenchError(f"{what}: the setting {field.name} needs a default (default=, not default_factory=)")
     check_declarations(config, what)
     hints, declared = typing.get_type_hints(config), fields(config)
-    for name, kind in REQUIRED_SETTINGS.items():
-        if hints[name] is not kind or declared[name].metadata.get("per_run"):
-            raise OffbenchError(f"{what}: the setting {name} must be declared as {kind.__name__}, and not per_run")
+    for name, kind in TRAINING_SETTINGS.items():
+        required = name in REQUIRED_SETTINGS
+        if name in declared and (hints[name] is not kind or (required and declared[name].metadata.get("per_run"))):
+            also = ", and not per_run" if required else ""
+            raise OffbenchError(f"{what}: the setting {name} must be declared as {kind.__name__}{also}")
     if config.__hash__ is None:
         raise OffbenchError(f"{what}: Config must be frozen: @dataclass(frozen=True)")
     return cls

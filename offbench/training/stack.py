@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from offbench.common.settings import short_repr
 from offbench.data.transitions import Transitions
 from offbench.rollouts.policy import Policy, check_networks
 from offbench.training.batches import CHUNK, StackData, draw_chunk
-from offbench.training.captured_update import CapturedUpdate
+from offbench.training.captured_update import CapturedUpdate, random_states
 from offbench.training.spec import RunSpec, settings_json
 
 Layers = Sequence[tuple[Tensor, Tensor]]
@@ -43,9 +42,9 @@ class Stack:
         if len(dims) != 1:
             raise OffbenchError(f"datasets of one stack must have the same shapes, not {sorted(dims)}")
         observation_dim, action_dim = dims.pop()
-        before = _random_states()
+        before = random_states(self.device)
         self.algorithm = algorithm_class(config, observation_dim, action_dim, self.seeds, self.device)
-        if _random_states() != before:
+        if random_states(self.device) != before:
             raise OffbenchError(
                 f"{algorithm_class.__name__}.setup draws random numbers that do not depend on a run's seed alone; use "
                 "self.network and self.parameters, or generators seeded by self.run_seeds"
@@ -154,11 +153,6 @@ class Stack:
                 bad = (~torch.isfinite(tensor)).transpose(0, 1).flatten(1).any(1).nonzero()
                 names |= {int(run): name for run in bad}
         return names
-
-
-def _random_states() -> tuple[object, ...]:
-    """Return the states of the generators that are shared by all code."""
-    return torch.get_rng_state().numpy().tobytes(), random.getstate(), repr(np.random.get_state())
 
 
 def _check_phase(algorithm: Algorithm) -> None:

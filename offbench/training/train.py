@@ -178,7 +178,7 @@ class Training:
         """
         jobs = [replace(job, deadline=deadline, cost=(cost or {}).get(job.first.algorithm, 1.0)) for job in self.jobs]
         jobs.sort(key=lambda job: -job.work)  # a long job that starts last would leave other processes idle
-        local = any(only_in_this_process(job.first.algorithm) for job in jobs)
+        local = len(jobs) > 1 and any(only_in_this_process(job.first.algorithm) for job in jobs)
         return execute(jobs, 1 if local else self.machine.processes) if jobs else []
 
 

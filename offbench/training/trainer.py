@@ -81,7 +81,9 @@ class Trainer:
                 resources.enter_context(run.locked())
             for run, spec, data in zip(self.runs, self.job.specs, self.stack.data, strict=True):
                 run.check_claimed(new_run_config(spec, data, self.job.device, ""))
-            if by_common_step(self.job.specs) not in ([], [list(self.job.specs)]):
+            if not (groups := by_common_step(self.job.specs)):
+                return []  # another process has finished all runs since they were claimed
+            if groups != [list(self.job.specs)] or any(run.diverged for run in self.runs):
                 raise OffbenchError(
                     f"{self.job.title}: another process has trained some of these runs since this command began; run "
                     "it again"
@@ -161,11 +163,11 @@ class Trainer:
         """Load the newest step that all runs have an intact checkpoint of, and drop what came after it.
 
         Raises:
-            OffbenchError: there is none, but some of several runs have intact checkpoints.
+            OffbenchError: there are checkpoints, but no intact ones of the same step.
         """
-        any_intact = False
         common = set.intersection(*(set(checkpoints.steps(run.folder)) for run in self.runs))
-        for step in sorted((s for s in common if s <= self.job.first.steps), reverse=True):
+        usable = sorted((step for step in common if step <= self.job.first.steps), reverse=True)
+        for step in usable:
             loaded = [checkpoints.load_checkpoint(run.folder, step) for run in self.runs]
             if all(loaded):
                 for i, (tensors, state) in enumerate(checkpoint for checkpoint in loaded if checkpoint):
@@ -173,10 +175,9 @@ class Trainer:
                     self.stack.captured_update.resume_logging(i, state.get("unlogged", []))
                 self.stack.step = step
                 break
-            any_intact = any_intact or any(loaded)
-        if any_intact and not self.stack.step:
+        if usable and not self.stack.step:
             raise OffbenchError(
-                f"{self.job.title}: the runs have intact checkpoints, but none of the same step; delete the runs "
+                f"{self.job.title}: no step is left of which every run has an intact checkpoint; delete the runs "
                 "whose checkpoints are damaged (see above), and rerun the command"
             )
         for i, run in enumerate(self.runs):

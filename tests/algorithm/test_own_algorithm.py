@@ -98,7 +98,7 @@ OWN: dict[str, tuple[type, str]] = {
             (load_algorithm("td3_bc"),),
             {"noise_spec": lambda self, c: {"target": Distribution((8, 1), "beta")}},
         ),
-        "noise_spec: 'target' must be normal or uniform, not 'beta'",
+        "AWAC.noise_spec: 'target' must be normal(*shape) or uniform(*shape) with sizes from 0, not Distribution",
     ),
     "nothing learned": (
         type("AWAC", (load_algorithm("td3_bc"),), {"setup": lambda self, c: None, "policy": elsewhere}),
@@ -126,7 +126,15 @@ OWN: dict[str, tuple[type, str]] = {
     ),
     "no default": (
         with_setting(("need", int)),
-        "the setting need needs a default",
+        "the setting need needs a default (default=, not default_factory=)",
+    ),
+    "a factory of a default": (
+        with_setting(("widths", tuple[int, ...], dataclasses.field(default_factory=lambda: (4, 4)))),
+        "the setting widths needs a default (default=, not default_factory=)",
+    ),
+    "a share of episodes that may be none": (
+        with_setting(("top", float | None, None)),
+        "the setting top must be declared as float",
     ),
     "a loss over all runs": (
         own(update=lambda self: self.critic.minimize(self.critic.flat.square().mean())),
@@ -147,7 +155,11 @@ OWN: dict[str, tuple[type, str]] = {
     ),
     "noise of a wrong shape": (
         own(noise_spec=lambda self: {"x": normal(0.5, 3)}),
-        "AWAC.noise_spec: 'x' must be normal(*shape) or uniform(*shape) of whole numbers, not Distribution",
+        "AWAC.noise_spec: 'x' must be normal(*shape) or uniform(*shape) with sizes from 0, not Distribution",
+    ),
+    "noise of a negative size": (
+        own(noise_spec=lambda self: {"x": normal(-1, 3)}),
+        "with sizes from 0, not Distribution",
     ),
     "noise of no distribution": (
         own(noise_spec=lambda self: {"x": (32, 3)}),

@@ -87,12 +87,14 @@ def test_a_stack_of_which_one_run_was_trained_further_is_left_alone(medium: str)
     assert [checkpoints.steps(run.folder) for run in runs] == [[400, 300], [200, 100]]
 
 
-def test_a_run_that_another_command_finishes_meanwhile_is_finished(medium: str) -> None:
+@pytest.mark.parametrize("steps", [200, 300])
+def test_a_run_that_another_command_finishes_meanwhile_is_finished(medium: str, steps: int) -> None:
+    """Even if it went on to more steps: their checkpoints are kept."""
     waiting = training(specs("td3_bc", medium, 200))
-    (run,) = train("td3_bc", medium, "runs", 200)
-    written = run.evaluations_path.read_bytes()
+    (run,) = train("td3_bc", medium, "runs", steps)
+    files = {path: path.read_bytes() for path in run.folder.iterdir()}
     assert waiting.run() == []
-    assert run.evaluations_path.read_bytes() == written
+    assert {path: path.read_bytes() for path in run.folder.iterdir()} == files
 
 
 def test_a_run_that_gets_results_while_its_lock_is_awaited_is_not_deleted(
@@ -132,7 +134,7 @@ def test_a_run_without_intact_checkpoints_does_not_take_its_stack_back_to_the_st
     damaged, whole = train("td3_bc", medium, "runs", 200, seeds=[0, 1])
     for step in (100, 200):
         (damaged.folder / f"checkpoint-{step:09d}.safetensors").write_bytes(b"damaged")
-    with pytest.raises(OffbenchError, match=r"none of the same step; delete the runs whose .* \(see above\)"):
+    with pytest.raises(OffbenchError, match=r"an intact checkpoint; delete the runs whose .* \(see above\)"):
         train("td3_bc", medium, "runs", 300, seeds=[0, 1])
     assert str(damaged.folder) in capsys.readouterr().err
     assert checkpoints.steps(whole.folder) == [200, 100]

@@ -205,26 +205,32 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(
     newest.write_bytes(data if damage == "one bit" else data[:1000])
     train("td3_bc", medium, "runs", 300)
     assert "checkpoint-000000200.safetensors is damaged" in (said := capsys.readouterr().err)
-    assert "using the one before it" in said
+    assert "it is not used" in said
     assert_same_files(run, whole)
+
+
+def test_a_run_whose_checkpoints_are_all_damaged_is_not_trained_anew(medium: str) -> None:
+    (run,) = train("td3_bc", medium, "runs", 300)
+    for step in (200, 300):
+        (run.folder / f"checkpoint-{step:09d}.safetensors").write_bytes(b"damaged")
+    written = run.evaluations_path.read_bytes()
+    with pytest.raises(OffbenchError, match="every run has an intact checkpoint; delete the runs"):
+        train("td3_bc", medium, "runs", 400)
+    assert run.evaluations_path.read_bytes() == written
 
 
 def test_damaged_checkpoints_do_not_outlive_the_new_ones(medium: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """If they counted as the newest two, every new one would be deleted as soon as it is written."""
     (run,) = train("td3_bc", medium, "runs", 300)
-    for step in (200, 300):
-        (run.folder / f"checkpoint-{step:09d}.safetensors").write_bytes(b"damaged")
-    save = checkpoints.save_checkpoint
+    (run.folder / "checkpoint-000000300.safetensors").write_bytes(b"damaged")
 
     def stopped(folder: Path, step: int, *content: Any) -> None:
-        if step == 200:
-            raise KeyboardInterrupt
-        save(folder, step, *content)
+        raise KeyboardInterrupt
 
     monkeypatch.setattr(checkpoints, "save_checkpoint", stopped)
     with pytest.raises(KeyboardInterrupt):
         train("td3_bc", medium, "runs", 400)
-    assert checkpoints.steps(run.folder) == [100]
+    assert checkpoints.steps(run.folder) == [200]
 
 
 def test_another_run_in_the_same_place_is_refused(tiny: tuple[str, str], medium: str) -> None:

@@ -136,6 +136,18 @@ def test_an_edited_cell_of_a_notebook_is_noticed(home: Path, medium: str, monkey
     train(CELL, steps=40)
 
 
+def test_an_error_in_a_scripts_class_is_the_scripts(
+    medium: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    notebook = types.ModuleType("__main__")
+    monkeypatch.setitem(sys.modules, "__main__", notebook)
+    exec(CELL.replace("weighed(1.0)", "{}['missing']"), vars(notebook))
+    small = {"hidden": (8,), "batch_size": [8, 16], "steps": 10, "eval_every": 10, "eval_episodes": 1, "workers": 1}
+    with pytest.raises(OffbenchError, match=r"an error in your script: KeyError: 'missing'.*see the traceback above"):
+        offbench.train(vars(notebook)["Mine"], medium, **small)
+    assert "Traceback" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("value", "other"),
     [
