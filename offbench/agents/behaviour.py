@@ -12,6 +12,7 @@ from offbench.agents.training_folder import TrainingFolder
 from offbench.common.errors import OffbenchError
 from offbench.common.processes import default_workers
 from offbench.common.seeds import check_seed
+from offbench.common.settings import check_count
 from offbench.envs.recipes import Recipe, load_recipe
 
 
@@ -42,12 +43,12 @@ def behaviour(
         OffbenchError: a bad argument, a folder of another training, or no policy better than random actions.
     """
     recipe, seed = env if isinstance(env, Recipe) else load_recipe(env), check_seed(seed)
-    steps = recipe.sac.steps if steps is None else steps
+    steps = recipe.sac.steps if steps is None else check_count("steps", steps)
     segment = recipe.sac.segment
     if steps < segment or steps % segment:
         raise OffbenchError(f"steps must be a multiple of {segment} (the recipe's segment), not {steps}")
     folder = TrainingFolder(recipe, seed, folder_of(recipe, seed, Path(behaviour_dir)))
-    ladder = check_output_folder(Path(out) if out else folder.path / "ladder")
+    ladder = check_output_folder(Path(out) if out else folder.path / "ladder", folder.path)
     train(folder, steps)
     name = recipe.name if isinstance(env, Recipe) else shlex.quote(str(env))
     command = f"offbench behaviour {name} --seed {seed} --steps {steps}"

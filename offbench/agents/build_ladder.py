@@ -207,19 +207,22 @@ class RungEvaluator:
         return steps
 
 
-def check_output_folder(out: Path) -> Path:
+def check_output_folder(out: Path, training: Path) -> Path:
     """Return the folder where a ladder may be written, absolute.
 
+    Args:
+        training: the folder of the training.
+
     Raises:
-        OffbenchError: it holds something else, which a new ladder would replace.
+        OffbenchError: it holds something else, which a new ladder would replace, or will hold the training.
     """
-    out = out.resolve()
+    out, training = out.resolve(), training.resolve()
+    if out in (training, *training.parents, training / "policies", training / "transitions"):
+        raise OffbenchError(f"{out} is a folder of the training itself ({training}); give another one for the ladder")
     if out.exists() and not out.is_dir():
         raise OffbenchError(f"{out} is a file; a ladder needs a folder of its own")
     if out.exists() and any(out.iterdir()) and not (out / "ladder.json").exists():
-        raise OffbenchError(
-            f"{out} contains other files, which a ladder would replace; delete it, or give an empty or new folder"
-        )
+        raise OffbenchError(f"{out} contains other files, which a ladder would replace; give an empty or new folder")
     return out
 
 
@@ -260,7 +263,7 @@ def build_ladder(folder: TrainingFolder, steps: int, out: Path, workers: int, co
     roles: dict[int, str] = dict.fromkeys(sorted(others | {medium, expert}), "")
     for step, role in ((medium, "medium"), (expert, "expert")):
         roles[step] = f"{roles[step]}+{role}".lstrip("+")
-    trained = read_json(folder.path / "training.json", f"delete {folder.path} to train the agent again")
+    trained = folder.read_description()
     info = trained | {
         "versions": trained["versions"] | {"offbench": versions()["offbench"]},
         "format": "offbench-ladder-1",
@@ -303,6 +306,7 @@ def _write(out: Path, evaluator: RungEvaluator, roles: dict[int, str], info: Jso
         if folder.recipe.replay_envs:
             info["medium_replay"] |= {"envs": folder.recipe.replay_envs}
         write_json(temporary / "ladder.json", info)
+        check_output_folder(out, folder.path)  # again: the training took hours
         old = replaced_folder(out)
         delete(old)
         if out.exists():

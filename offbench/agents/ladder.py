@@ -209,6 +209,8 @@ def find_ladder(recipe: Recipe, behaviour_dir: Path = BEHAVIOUR, retrain: bool =
     if not shipped:
         inform(f"using the behaviour agent trained here: {ladder.folder}")
         _warn_other_recipe(ladder, recipe)
+    elif behaviour_dir != BEHAVIOUR:
+        inform(f"using the behaviour agent shipped with offbench, not one in {behaviour_dir}; `--retrain` uses that")
     warn_other_physics(f"the behaviour agent of {recipe.name}", ladder.info.versions, recipe.env_spec())
     return ladder
 

@@ -34,18 +34,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from offbench.agents.sac_checkpoint import restore, save_segment_end, save_within_segment, transitions_since
 from offbench.agents.sb3_zip import sac_layers
-from offbench.agents.training_folder import TrainingFolder, read_rungs
+from offbench.agents.training_folder import RUNG_COLUMNS, TrainingFolder, read_rungs
 from offbench.common import checkpoints, seeds
 from offbench.common.code_hash import describe_changes
 from offbench.common.errors import OffbenchError
-from offbench.common.files import (
-    JsonObject,
-    csv_bytes,
-    read_json,
-    write_bytes,
-    write_errors,
-    write_json,
-)
+from offbench.common.files import JsonObject, csv_bytes, write_bytes, write_errors, write_json
 from offbench.common.interrupts import collect_stop_signals
 from offbench.common.progress import Progress, duration
 from offbench.common.provenance import hardware, versions
@@ -56,14 +49,8 @@ from offbench.envs.environments import Env, make_env
 from offbench.envs.margin_rule import MAX_RULE
 from offbench.envs.recipes import Recipe, SACSettings
 from offbench.rollouts.policy import Policy
-from offbench.rollouts.rollouts import MEASURES, ErrorReporting, Rollouts, summary
+from offbench.rollouts.rollouts import ErrorReporting, Rollouts, summary
 
-RUNG_COLUMNS = (
-    "step",
-    "hours",
-    *(f"{how}_{m}" for how in ("stochastic", "deterministic") for m in MEASURES),
-    "episodes",
-)
 MAX_POLICIES = 100  # saved policies of a segment, including its rung
 MAX_POLICY_BYTES = 6_000_000  # bytes of a segment's policies: 20 of hopper's
 LARGE_CHANGE = 0.05  # share of the range of returns; after a smaller change, policies within a segment are deleted
@@ -96,8 +83,8 @@ def _check_identity(folder: TrainingFolder) -> None:
         origin = {"recipe_sha256": folder.recipe.sha256(), "versions": versions(), "hardware": hardware()}
         write_json(path, identity | {"env_code": code} | origin)
         return
-    recorded = read_json(path, f"delete {folder.path} to train the agent again")
-    if edited := describe_changes(recorded.get("env_code", {}), code):
+    recorded = folder.read_description()
+    if edited := describe_changes(recorded["env_code"], code):
         raise OffbenchError(
             f"the training in {folder.path} began in other code of its environment: {edited}; delete it to train again"
         )
@@ -115,7 +102,7 @@ def _check_identity(folder: TrainingFolder) -> None:
 
 def _warn_other_versions(folder: TrainingFolder) -> None:
     """Warn if this training was started with other versions of the packages that it depends on."""
-    before = read_json(folder.path / "training.json", f"delete {folder.path} to train the agent again")["versions"]
+    before = folder.read_description()["versions"]
     if changed := [f"{name} {old}, not {now}" for name, now in versions().items() if (old := before.get(name)) != now]:
         warn(
             f"the training in {folder.path} was started with {', '.join(changed)}; its results may differ from here on"

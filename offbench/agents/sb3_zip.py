@@ -21,7 +21,7 @@ import numpy as np
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject, open_regular, read_errors
-from offbench.rollouts.policy import ACTIVATIONS, Layers, Policy
+from offbench.rollouts.policy import ACTIVATIONS, Layers, Policy, check_networks
 
 MAX_MEMBER_SIZE = 2**30  # bytes of a member, unpacked
 FLATTEN = "<class 'stable_baselines3.common.torch_layers.FlattenExtractor'>"  # leaves vectors as they are
@@ -63,7 +63,12 @@ def read_sb3_zip(path: Path, low: Array, high: Array, env_id: str) -> Policy:
     low, high = _bounds(settings, "low", low, actions), _bounds(settings, "high", high, actions)
     zeros = np.zeros(layers[0][0].shape[0], np.float32)
     origin = {"algorithm": f"{algorithm} (Stable-Baselines3)"}
-    return Policy(kind, layers, zeros, zeros + 1, low, high, env_id, origin, activation=activation)
+    policy = Policy(kind, layers, zeros, zeros + 1, low, high, env_id, origin, activation=activation)
+    try:
+        check_networks(policy, len(zeros), actions)
+    except ValueError as error:
+        raise OffbenchError(f"{path} is not an MLP policy as SB3 saves it: {error}") from None
+    return policy
 
 
 def _read(path: Path) -> tuple[dict[str, Array], JsonObject]:

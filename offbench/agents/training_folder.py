@@ -19,9 +19,24 @@ import numpy as np
 
 from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
-from offbench.common.files import exclusive_lock, open_regular, read_errors, read_text, remove_leftovers
+from offbench.common.files import (
+    JsonObject,
+    exclusive_lock,
+    open_regular,
+    read_errors,
+    read_json,
+    read_text,
+    remove_leftovers,
+)
 from offbench.envs.recipes import Recipe
+from offbench.rollouts.rollouts import MEASURES
 
+RUNG_COLUMNS = (
+    "step",
+    "hours",
+    *(f"{how}_{m}" for how in ("stochastic", "deterministic") for m in MEASURES),
+    "episodes",
+)
 TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
@@ -37,6 +52,16 @@ class TrainingFolder:
     def rungs(self) -> Path:
         """The screening returns of every rung."""
         return self.path / "rungs.csv"
+
+    def read_description(self) -> JsonObject:
+        """Return training.json. Raises OffbenchError if it is missing or damaged."""
+        path, remedy = self.path / "training.json", f"delete {self.path} to train the agent again"
+        description: JsonObject = {"versions": {}, "env_code": {}} | read_json(path, remedy)
+        with read_errors(str(path), "is damaged", remedy):
+            for key in ("versions", "env_code"):
+                if not isinstance(description[key], dict):
+                    raise ValueError(f"{key} is not an object")
+        return description
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -71,7 +96,12 @@ class TrainingFolder:
                 open(path, "rb", opener=open_regular) as file,
                 np.load(file, allow_pickle=False) as arrays,
             ):
-                return {name: arrays[name] for name in TRANSITIONS}
+                found = {name: arrays[name] for name in TRANSITIONS}
+                for name, array in found.items():
+                    dims = 3 if name in ("observations", "next_observations", "actions") else 2
+                    if array.ndim != dims or array.shape[:2] != found["rewards"].shape:
+                        raise ValueError(f"{name} have shape {array.shape}")
+                return found
         except FileNotFoundError:
             raise OffbenchError(f"{path} is missing; {remedy}") from None
 
@@ -83,5 +113,7 @@ def read_rungs(path: Path) -> list[dict[str, float]]:
     with read_errors(str(path), "is damaged", "delete its folder to train the agent again"):
         lines = read_text(path).splitlines()
         header = lines[0].split(",")
+        if missing := [column for column in RUNG_COLUMNS if column not in header]:
+            raise ValueError(f"it has no column {missing[0]}")
         rows = [dict(zip(header, map(float, line.split(",")), strict=True)) for line in lines[1:]]
         return [row | {"step": int(row["step"]), "episodes": int(row["episodes"])} for row in rows]

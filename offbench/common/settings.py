@@ -162,11 +162,11 @@ def without_numpy(value: object) -> Any:
     return value.tolist() if numpy and isinstance(value, numpy.generic | numpy.ndarray) else value
 
 
-def check_count(name: str, value: object) -> int:
-    """Return a whole number from 1 that a user of the Python interface gave. Raises OffbenchError for other values."""
+def check_count(name: str, value: object, low: int = 1) -> int:
+    """Return a whole number from `low` that a user of the Python interface gave. Raises OffbenchError for others."""
     value = without_numpy(value)
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise OffbenchError(f"{name} must be a whole number from 1, not {short_repr(value)}")
+    if not isinstance(value, int) or isinstance(value, bool) or value < low:
+        raise OffbenchError(f"{name} must be a whole number from {low}, not {short_repr(value)}")
     return value
 
 

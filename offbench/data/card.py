@@ -24,10 +24,10 @@ from offbench.common.plotting import default_style, figure, save
 from offbench.common.provenance import PHYSICS, versions
 from offbench.common.scores import normalize
 from offbench.common.tables import markdown
-from offbench.common.terminal import warn
+from offbench.common.terminal import inform, warn
 from offbench.data import minari_store
 from offbench.data.levels import LEVELS, full_size
-from offbench.data.show import Summary, show
+from offbench.data.show import Summary, bin_range, show
 from offbench.envs.recipes import Recipe, load_recipe
 
 BINS = 50
@@ -73,17 +73,15 @@ def card(env: str | Path, out: str | Path | None = None, behaviour_dir: str | Pa
     return folder
 
 
-def compare_with_card(recipe: Recipe, level: str, content_sha256: str) -> str | None:
-    """Return a line that says whether a level recorded at full size has the content on the shipped card.
-
-    None if there is no card, or if the level is not one of the five.
-    """
+def compare_with_card(recipe: Recipe, level: str, content_sha256: str) -> None:
+    """Print whether a level recorded at full size has the content on the shipped card, if the card has that level."""
     card = _shipped_card(recipe)
     if card is None or level not in card["levels"]:
-        return None
+        return
     contents = card["levels"][level]["content_sha256"]
     if content_sha256 in contents.values():
-        return "content equal to the dataset card's, bit for bit"
+        inform("content equal to the dataset card's, bit for bit")
+        return
     here = versions()["mujoco"]
     used = card["versions"] | {"mujoco": here if here in contents else next(iter(contents))}
     others = [f"{name} {version}" for name, version in used.items() if versions()[name] != version]
@@ -92,7 +90,7 @@ def compare_with_card(recipe: Recipe, level: str, content_sha256: str) -> str | 
         if others
         else "although the versions are the same (a different processor or C library?)"
     )
-    return f"warning: content differs from the dataset card's, {reason}"
+    warn(f"content differs from the dataset card's, {reason}")
 
 
 def expected_episode_length(recipe: Recipe, level: str) -> float | None:
@@ -253,8 +251,7 @@ def _draw(recipe: Recipe, ladder: Ladder, levels: Mapping[str, Summary], path: P
     left.plot([r.step for r in kept], [r.ret for r in kept], "o", markersize=4, color=RED, label="kept")
     left.set(xlabel="environment steps", ylabel="return", title=f"SAC on {recipe.env_id}")
     left.legend(frameon=False)
-    low = min(float(summary.returns.min()) for summary in levels.values())
-    high = max(float(summary.returns.max()) for summary in levels.values())
+    low, high = bin_range(np.concatenate([summary.returns for summary in levels.values()]))
     edges = np.linspace(low, high, BINS + 1)
     for bottom, summary in enumerate(levels.values()):
         counts, _ = np.histogram(summary.returns, edges)

@@ -30,7 +30,7 @@ from offbench.envs.recipes import load_recipe
 from offbench.rollouts.rollouts import Episode
 
 # two recordings with the same values of these metadata, on the same versions of these packages, are the same
-IDENTITY = ("env", "level", "seed", "recipe_sha256", "parts", "references")
+IDENTITY = ("env", "seed", "recipe_sha256", "parts", "references")
 REPOSITORY = "https://github.com/offbench/offbench"
 
 
@@ -87,6 +87,8 @@ def collect(
     else:
         if mix is not None or level != "medium":
             raise OffbenchError("--policy records one policy: leave out --level and --mix")
+        if accept:
+            raise OffbenchError("--accept is about the policy that --level or --mix chooses; --policy records its own")
         name = level = level_name(name, str(policy))
         policy_source, parts = str(policy), (Part(POLICY),)
     dataset_id = minari_store.check_id(dataset_id or f"{recipe.name}-{name}-v{recipe.version}")
@@ -97,7 +99,8 @@ def collect(
         return Recording(recipe, parts, ladder, seed, workers, policy_source, steps=steps, accept=accept)
 
     ladder = find_ladder(recipe, Path(behaviour_dir), retrain)
-    has_agent = ladder is not None or all(part.source in WITHOUT_AGENT for part in parts)
+    # with --retrain, a level without an agent still has the references of one
+    has_agent = ladder is not None or (not retrain and all(part.source in WITHOUT_AGENT for part in parts))
     recording = recording_with(ladder) if has_agent else None
     if recording and not overwrite and _is_recorded(recording, dataset_id, mix or level):
         if recording.calls_function:
@@ -117,8 +120,8 @@ def collect(
         with Progress(total, f"recording {dataset_id}") as progress:
             episodes = _counted(recording.episodes(), progress)
             content = minari_writer.write(path, episodes, recording.env_spec, metadata, total, recording.spaces)
-    if seed == 0 and steps is None and not retrain and (comparison := compare_with_card(recipe, name, content)):
-        inform(comparison)
+    if seed == 0 and steps is None and not retrain:
+        compare_with_card(recipe, name, content)
     if ladder:
         warn_other_references(recipe, ladder)
     return dataset_id

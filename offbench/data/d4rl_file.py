@@ -39,8 +39,9 @@ class Source:
         return self.columns["observations"].shape[1], self.columns["actions"].shape[1]
 
     def read(self, name: str, first: int, end: int) -> Array:
-        """Return rows [first, end) of a column; rewards and flags flat."""
+        """Return rows [first, end) of a column, in this machine's byte order; rewards and flags flat."""
         rows: Array = self.columns[name][first:end]
+        rows = rows.astype(rows.dtype.newbyteorder("="), copy=False)
         return rows.reshape(len(rows)) if rows.ndim == 2 and name not in _WIDE else rows
 
 

@@ -7,11 +7,14 @@ import shutil
 import sys
 from pathlib import Path
 
-from offbench.common.errors import OffbenchError
+from offbench.common.errors import LockedError, OffbenchError
 from offbench.common.files import exclusive_lock, write_errors
 from offbench.common.processes import environment
+from offbench.common.terminal import inform
 from offbench.common.text import printable
 from offbench.data import minari_store
+
+MAX_WAIT = 3600.0  # seconds to wait for the download of another process
 
 
 def download(dataset_id: str) -> None:
@@ -26,7 +29,13 @@ def download(dataset_id: str) -> None:
         return
     target = minari_store.path_of(dataset_id)
     root = minari_store.root()
-    with exclusive_lock(root / ".offbench-download.lock", "another dataset is being downloaded"):
+    with contextlib.ExitStack() as held:
+        lock, what = root / ".offbench-download.lock", "another dataset is being downloaded"
+        try:
+            held.enter_context(exclusive_lock(lock, what))
+        except LockedError as error:
+            inform(str(error))
+            held.enter_context(exclusive_lock(lock, what, MAX_WAIT))
         if minari_store.exists(dataset_id):  # another process was faster
             return
         temporary = root / ".offbench-download"

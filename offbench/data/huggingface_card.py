@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from offbench.common.files import output_file, write_bytes
+from offbench.common.files import output_file, read_errors, read_text, write_bytes
 from offbench.common.scores import normalize
 from offbench.common.tables import markdown, plain
 from offbench.data import minari_store
@@ -17,7 +17,7 @@ MAX_SIZE_CATEGORY = "10M<n<100M"
 
 
 def huggingface_card(dataset_id: str, out: str | Path | None = None) -> Path:
-    """Write a dataset's card for the Hugging Face Hub.
+    """Write a dataset's card for the Hugging Face Hub; the license that an existing card states is kept.
 
     Args:
         dataset_id: a local Minari dataset.
@@ -32,15 +32,25 @@ def huggingface_card(dataset_id: str, out: str | Path | None = None) -> Path:
     summary = show(dataset_id)
     folder = minari_store.path_of(dataset_id)
     target = output_file(folder / "README.md" if out is None else out)
-    write_bytes(target, ("\n".join([*_header(summary), "", *_text(summary)]) + "\n").encode())
+    write_bytes(target, ("\n".join([*_header(summary, _license(target)), "", *_text(summary)]) + "\n").encode())
     return target
 
 
-def _header(summary: Summary) -> Iterator[str]:
-    """Return the YAML that the Hub reads. It states no license: the uploader chooses one."""
+def _license(card: Path) -> list[str]:
+    """Return the lines of an existing card's YAML that state its license."""
+    if not card.exists():
+        return []
+    with read_errors(str(card), "is not readable text", "delete it"):
+        header = read_text(card).partition("\n---")[0]
+    return [line for line in header.splitlines() if line.startswith("license")]
+
+
+def _header(summary: Summary, license_lines: list[str]) -> Iterator[str]:
+    """Return the YAML that the Hub reads. It states no license of its own: the uploader chooses one."""
     steps = int(summary.lengths.sum())
     yield "---"
     yield f"pretty_name: {json.dumps(summary.dataset_id)}"
+    yield from license_lines
     yield "task_categories: [reinforcement-learning]"
     yield "tags: [reinforcement-learning, offline-rl, minari, gymnasium]"
     size = next((name for most, name in SIZES.items() if steps < most), MAX_SIZE_CATEGORY)

@@ -47,7 +47,7 @@ from offbench.envs.environments import (
 )
 from offbench.envs.margin_rule import MARGIN_KEY, SUM_RULE, without_margin
 from offbench.envs.recipes import D4RL_LIMIT, Recipe, d4rl_reference_of_env, load_recipe, shipped_recipes
-from offbench.rollouts.rollouts import Episode
+from offbench.rollouts.rollouts import Episode, reset
 
 BLOCK = 65_536  # rows read at once
 RESETS = 64  # number of resets of the environment, to learn where episodes begin
@@ -108,11 +108,13 @@ class _Origin:
         recorded: the EnvSpec (JSON) of the environment it was recorded in, None if unknown.
         evaluated: EnvSpec of the environment to evaluate policies in.
         recipe: whose action bounds hold where the file has none.
+        by_d4rl: whether D4RL itself recorded it, by its name: with a MuJoCo before 3.5.
     """
 
     recorded: str | None
     evaluated: str | None
     recipe: Recipe | None = None
+    by_d4rl: bool = False
 
     @property
     def limit(self) -> int | None:
@@ -138,11 +140,11 @@ def _origin(source: Source, env: str | Path | None) -> _Origin:
         return _Origin(about.get("env_spec") or spec, spec, recipe)
     if exported or "env_spec" in about:
         return _Origin(about.get("env_spec"), about.get("eval_env_spec"))
-    word, _, rest = path.stem.lower().replace("-", "_").partition("_")
-    matches = [name for name in shipped_recipes() if word and name.replace("-", "_").startswith(word)]
-    if len(matches) != 1 or not rest.startswith(LEVEL_WORDS):
-        raise OffbenchError(f"cannot tell the environment of {path.name}; give it, e.g. --env hopper")
-    return _by_name(source, load_recipe(matches[0]))
+    stem = path.stem.lower().replace("-", "_")
+    for name in shipped_recipes():
+        if stem.startswith(tuple(f"{name.replace('-', '_')}_{word}" for word in LEVEL_WORDS)):
+            return _by_name(source, load_recipe(name))
+    raise OffbenchError(f"cannot tell the environment of {path.name}; give it, e.g. --env hopper")
 
 
 def _by_name(source: Source, recipe: Recipe) -> _Origin:
@@ -161,7 +163,7 @@ def _by_name(source: Source, recipe: Recipe) -> _Origin:
             f"{_words(source.shapes)}; give its environment, e.g. --env my-env.toml"
         )
     if today == source.shapes:
-        return _Origin(recorded, spec, recipe)
+        return _Origin(recorded, spec, recipe, by_d4rl=name is not None)
     warn(
         f"{source.path.name} is of {name}, which has {_words(shapes)}, and {recipe.env_id} has "
         f"{_words(today)}: policies are not evaluated"
@@ -263,7 +265,7 @@ def _starts(source: Source, origin: _Origin) -> Array:
         )
         return starts
     env = make_env(origin.evaluated) if origin.recipe else untrusted_env(origin.evaluated, str(source.path))
-    first_ones = np.array([env.reset(seed=seed)[0] for seed in range(RESETS)], np.float64)
+    first_ones = np.array([reset(env, seed) for seed in range(RESETS)], np.float64)
     env.close()
     middle, spread = (first_ones.max(0) + first_ones.min(0)) / 2, (first_ones.max(0) - first_ones.min(0)) / 2
     slack, was_away = 1e-6 * (1 + np.abs(middle)), np.array([True])
@@ -352,7 +354,7 @@ def _metadata(source: Source, origin: _Origin, dataset_id: str) -> tuple[JsonObj
             for key in ("references", MARGIN_KEY):
                 provenance.pop(key, None)
             provenance["d4rl"] = d4rl_reference_of_env(metadata["eval_env_spec"])
-        if rule == SUM_RULE:
+        if rule == SUM_RULE or origin.by_d4rl:
             provenance[MARGIN_KEY] = rule
     return metadata, _spaces(source, origin.recipe)
 

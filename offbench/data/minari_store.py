@@ -38,11 +38,17 @@ class Provenance:
     """What offbench recorded about a dataset; empty for datasets of other programs.
 
     Attributes:
+        env: the recipe's name.
+        level: the level as the user gave it, or the name of a policy of the user's own.
+        seed: seed of the episodes.
         parts: definition and measured return of each part, as in offbench.data.levels.
         full_size: transitions at the recipe's size.
         references: the episodes behind `ref_min_score` (`random`) and `ref_max_score` (`expert`).
         d4rl: D4RL's reference scores.
+        contact_margin: the rule for contact margins, as in offbench.envs.margin_rule.
         env_code: hashes of the environment's code and files, if it is not Gymnasium's.
+        versions: of the packages that recorded it.
+        content_sha256: hash of all episodes, as in offbench.data.content_hash.
         imported: the D4RL file that the dataset was imported from.
         timeouts: for an import, whether the steps at a timeout are `kept` or `dropped`.
         final_observations: for an import, whether the last observations of terminated episodes are `kept`, or the
@@ -79,9 +85,12 @@ def check_id(dataset_id: str) -> str:
     """Return `dataset_id` if Minari can parse it: `name-v0` or `namespace/name-v0`."""
     try:
         parse_dataset_id(dataset_id)
+        if Path(dataset_id).as_posix() != dataset_id:
+            raise ValueError("it has an empty part")
     except (ValueError, TypeError):
         raise OffbenchError(
-            f"{dataset_id!r} is not a dataset id: use letters, digits, - and _, and end with -v0"
+            f"{dataset_id!r} is not a dataset id: use letters, digits, - and _, and end with a version such as -v0; a "
+            "namespace may precede it, as in mine/name-v0"
         ) from None
     return dataset_id
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from offbench.common.arrays import Array
-from offbench.common.errors import OffbenchError
 from offbench.common.files import JsonObject
 from offbench.common.plotting import default_style, figure, picture_file, save
 from offbench.common.scores import normalize
@@ -68,7 +67,7 @@ class Summary:
         path = picture_file(path)
         with default_style():
             fig, (axes,) = figure()
-            axes.hist(self.returns, bins=40, color="#3b6ea5")
+            axes.hist(self.returns, bins=40, range=bin_range(self.returns), color="#3b6ea5")
             axes.axvline(self.returns.mean(), color="#c44", linewidth=1.2, label=f"mean {self.returns.mean():.0f}")
             axes.set(xlabel="return", ylabel="episodes", title=self.dataset_id)
             axes.legend(frameon=False)
@@ -105,10 +104,16 @@ def space(metadata: JsonObject, key: str) -> str:
         return "unknown"
 
 
+def bin_range(values: Array) -> tuple[float, float]:
+    """Return the range of a histogram; wider than the values' if they differ by rounding at most."""
+    low, high = float(values.min()), float(values.max())
+    if high - low > 1e-9 * (1 + abs(high)):
+        return low, high
+    return low - 0.5, high + 0.5
+
+
 def _histogram(values: Array) -> list[str]:
     """Return a histogram as lines of text."""
-    if not len(values):
-        raise OffbenchError("the dataset has no episodes")
-    counts, edges = np.histogram(values, BINS)
+    counts, edges = np.histogram(values, BINS, bin_range(values))
     bars = ["█" * round(BAR * count / counts.max()) for count in counts]
     return [f"{edges[i]:>10.1f} to {edges[i + 1]:>9.1f}  {bars[i]:<{BAR}} {counts[i]:,}".rstrip() for i in range(BINS)]

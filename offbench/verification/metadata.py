@@ -43,10 +43,20 @@ def check_recorded_metadata(
             for index, (part, (first, end)) in enumerate(zip(provenance.parts, ranges, strict=True)):
                 _check_part(provenance, part, index, range(first, end), scanned, limit, findings)
             last = [end - 1 for _, end in ranges]
+            _add_checked(provenance.parts, report)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, ZeroDivisionError, OverflowError) as error:
         findings.add("metadata", "metadata", f"{type(error).__name__}: {error}")
-    report.checked.append("parts, seeds, level order and mean returns against the metadata")
     return last
+
+
+def _add_checked(parts: Sequence[JsonObject], report: Report) -> None:
+    """Add what of the metadata was checked to a report; a replay has no seeds, and not every policy has a return."""
+    checked = ["sizes of the parts"]
+    if any(part["source"] != "replay" for part in parts):
+        checked.append("seeds")
+    if any("return" in part for part in parts):
+        checked.append("level order and mean returns")
+    report.checked.append(f"{', '.join(checked)} against the metadata")
 
 
 def _part_ranges(parts: Sequence[JsonObject], scanned: ScanResult, findings: Findings) -> list[tuple[int, int]] | None:

@@ -19,6 +19,7 @@ from offbench.common.files import JsonObject
 from offbench.common.processes import blocking_workers, default_workers
 from offbench.common.provenance import versions
 from offbench.common.seeds import Purpose
+from offbench.common.settings import check_count
 from offbench.common.text import counted
 from offbench.data import minari_store
 from offbench.data.file_stamps import unchanged
@@ -65,7 +66,10 @@ def _verify(dataset_id: str, episodes: int | None, workers: int | None) -> Repor
     report, findings = Report(dataset_id), Findings()
     if not minari_store.exists(dataset_id):
         minari_store.read_metadata(dataset_id)  # raises, and names the nearest id
-    workers, episodes = default_workers(workers), EPISODES if episodes is None else episodes
+    workers, episodes = (
+        default_workers(workers),
+        check_count("episodes", EPISODES if episodes is None else episodes, 0),
+    )
     code = "metadata"
     try:
         metadata = minari_store.read_metadata(dataset_id)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+import offbench
 from offbench.agents.build_ladder import RungEvaluator
 from offbench.agents.ladder import Ladder, LadderInfo, Replay, Rung, folder_of, read_ladder
 from offbench.agents.training_folder import TrainingFolder, read_rungs
@@ -175,6 +176,26 @@ def test_a_damaged_ladder_is_said(tiny: tuple[str, str], home: Path, fault: str)
     path.write_text(damaged[fault])
     with pytest.raises(OffbenchError, match="damaged"):
         read_ladder(folder)
+
+
+@pytest.mark.parametrize("out", ["tiny/seed-0", "tiny", ".", "tiny/seed-0/policies"])
+def test_a_ladder_does_not_replace_its_training(tiny: tuple[str, str], out: str) -> None:
+    with pytest.raises(OffbenchError, match=r"is a folder of the training itself .*; give another one for the ladder"):
+        offbench.behaviour(tiny[0], behaviour_dir=tiny[1], out=Path(tiny[1]) / out)
+
+
+def test_a_damaged_training_is_said(tiny: tuple[str, str], home: Path) -> None:
+    shutil.copytree(tiny[1], home / "behaviour")
+    folder = home / "behaviour" / "tiny" / "seed-0"
+    for name, old, new, message in (
+        ("rungs.csv", "stochastic_return", "return", "it has no column stochastic_return"),
+        ("training.json", '"versions": {', '"versions": 3, "others": {', "versions is not an object"),
+    ):
+        text = (folder / name).read_text()
+        (folder / name).write_text(text.replace(old, new))
+        with pytest.raises(OffbenchError, match=rf"{name} is damaged \({message}\); delete"):
+            offbench.behaviour(tiny[0], out=home / "out")
+        (folder / name).write_text(text)
 
 
 def test_no_ladder_is_no_error(home: Path) -> None:

@@ -41,6 +41,8 @@ CASES: dict[str, tuple[str, str]] = {
     "collect hopper --id nodigits": ("'nodigits' is not a dataset id", "-v0"),
     "collect hopper --id ../../etc-v0": ("is not a dataset id", ""),
     "collect hopper --id /tmp/x-v0": ("is not a dataset id", ""),
+    "collect hopper --id mine//x-v0": ("is not a dataset id", "mine/name-v0"),
+    "collect hopper --policy x.zip --accept": ("--accept is about the policy that --level or --mix chooses", ""),
     "collect hopper --mix random": ("--mix takes LEVEL:SHARE", ""),
     "collect hopper --mix random:0.5,expert:0.4": ("must add up to 1, not 0.9", ""),
     "collect hopper --level expert --mix random:0.5,expert:0.5": ("give --level or --mix, not both", ""),

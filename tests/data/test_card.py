@@ -90,27 +90,27 @@ def test_a_card_is_made_from_the_five_levels(home: Path, capfd: pytest.CaptureFi
         card("inverted-pendulum")
 
 
-def test_another_content_is_said_with_the_likely_reason(home: Path) -> None:
+def test_another_content_is_said_with_the_likely_reason(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recipe = replace(load_recipe("hopper"), folder=home)
-    assert compare_with_card(recipe, "medium", "abc") is None  # no card
+
+    def said(level: str, content: str) -> str:
+        compare_with_card(recipe, level, content)
+        return capsys.readouterr().err
+
+    assert said("medium", "abc") == ""  # no card
     here = versions()["mujoco"]
     contents = {here: "abc", "3.4.9": "abe"}
     known = {"versions": {"numpy": versions()["numpy"]}, "levels": {"medium": {"content_sha256": contents}}}
     (home / "card.json").write_text(json.dumps(known))
-    assert compare_with_card(recipe, "60percent", "abc") is None  # no such level on it
-    assert compare_with_card(recipe, "medium", "abc") == "content equal to the dataset card's, bit for bit"
-    assert (
-        compare_with_card(recipe, "medium", "abe") == "content equal to the dataset card's, bit for bit"
-    )  # the earlier MuJoCo's
-    assert "although the versions are the same" in str(compare_with_card(recipe, "medium", "abd"))
+    assert said("60percent", "abc") == ""  # no such level on it
+    for content in contents.values():  # also the earlier MuJoCo's
+        assert said("medium", content) == "offbench: content equal to the dataset card's, bit for bit\n"
+    differs = "offbench: warning: content differs from the dataset card's, "
+    assert said("medium", "abd").startswith(f"{differs}although the versions are the same")
     (home / "card.json").write_text(json.dumps(known | {"levels": {"medium": {"content_sha256": {"3.4.9": "abe"}}}}))
-    assert "differs from the dataset card's, which was made with mujoco 3.4.9" in str(
-        compare_with_card(recipe, "medium", "abd")
-    )
+    assert said("medium", "abd") == f"{differs}which was made with mujoco 3.4.9\n"
     (home / "card.json").write_text(json.dumps(known | {"versions": {"numpy": "0.1"}}))
-    assert "differs from the dataset card's, which was made with numpy 0.1" in str(
-        compare_with_card(recipe, "medium", "abd")
-    )
+    assert said("medium", "abd") == f"{differs}which was made with numpy 0.1\n"
 
 
 def test_an_environment_without_a_ladder_has_no_card(home: Path) -> None:

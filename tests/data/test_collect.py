@@ -198,6 +198,30 @@ def test_random_is_recorded_once(tiny: tuple[str, str], capfd: pytest.CaptureFix
     assert "is recorded already" in capfd.readouterr().err
 
 
+def test_another_spelling_of_a_level_is_the_same_dataset(
+    tiny: tuple[str, str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    for level in ("random:0.5,medium:0.5", "random:0.50, medium:0.5"):
+        offbench.collect(tiny[0], mix=level, behaviour_dir=tiny[1], workers=1)
+    assert "is recorded already" in capfd.readouterr().err
+
+
+def test_retrain_trains_for_random_too(tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its expert reference is the agent's."""
+
+    def trained(*_: object) -> None:
+        raise OffbenchError("training")
+
+    monkeypatch.setattr("offbench.data.collect._train", trained)
+    with pytest.raises(OffbenchError, match="training"):
+        offbench.collect("inverted-pendulum", "random", retrain=True, workers=1)
+
+
+def test_a_shipped_agent_is_said_where_another_folder_is_named(home: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    offbench.collect("inverted-pendulum", "medium", steps=200, behaviour_dir=home / "mine", workers=1)
+    assert "using the behaviour agent shipped with offbench, not one in" in capfd.readouterr().err
+
+
 def test_neighbors_of_a_fraction(ladder_at: Callable[[dict[str, float]], tuple[str, Path]]) -> None:
     from offbench.agents.ladder import read_ladder
 

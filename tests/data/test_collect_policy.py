@@ -84,6 +84,20 @@ def test_any_text_of_the_bounds_is_read_or_ignored(text: object, home: Path) -> 
     assert policy.high == HIGH
 
 
+def test_layers_that_do_not_fit_together_are_refused(home: Path) -> None:
+    _, path = saved("td3", home)
+    with zipfile.ZipFile(path) as archive:
+        weights, data = torch.load(io.BytesIO(archive.read("policy.pth"))), archive.read("data")
+    weights["actor.mu.0.weight"], weights["actor.mu.0.bias"] = torch.zeros(5, 4), torch.zeros(5)
+    changed = io.BytesIO()
+    torch.save(weights, changed)
+    with zipfile.ZipFile(home / "odd.zip", "w") as archive:
+        archive.writestr("policy.pth", changed.getvalue())
+        archive.writestr("data", data)
+    with pytest.raises(OffbenchError, match=r"odd\.zip is not an MLP policy as SB3 saves it: a layer of shape"):
+        read_sb3_zip(home / "odd.zip", LOW, HIGH, ENV)
+
+
 def test_a_hostile_zip_is_refused(home: Path, tiny: tuple[str, str]) -> None:
     _, path = saved("td3", home)
     evil = io.BytesIO()
@@ -259,6 +273,7 @@ def test_a_controller_with_limits_of_its_own_verifies(
     report = offbench.verify(dataset)
     assert report.ok
     assert "these are limits of the behaviour policy" in report.warnings[0]
+    assert "sizes of the parts, seeds against the metadata" in report.checked
 
 
 POLICIES = """

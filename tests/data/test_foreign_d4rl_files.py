@@ -188,6 +188,32 @@ def test_seeds_of_64_bits_travel(seeds: list[int | None], home: Path) -> None:
     assert [e.seed for e in episodes_of(open_minari("back-v0"))] == seeds
 
 
+def test_numbers_in_another_byte_order(home: Path, rng: np.random.Generator) -> None:
+    columns = still(600, rng)
+    columns["timeouts"] = np.arange(600) % 200 == 199
+    swapped = {name: values.astype(values.dtype.newbyteorder(">")) for name, values in columns.items()}
+    for name, kind in (("little", columns), ("big", swapped)):
+        write(home / f"{name}.hdf5", **kind)
+        import_d4rl(home / f"{name}.hdf5", f"{name}-v0", env="inverted-pendulum")
+    hashes = {
+        minari_store.read_provenance(minari_store.read_metadata(f"{n}-v0")).content_sha256 for n in ("little", "big")
+    }
+    assert len(hashes) == 1
+    assert not any("dtype" in line for line in verify("big-v0", episodes=0).lines())
+
+
+def test_an_environment_that_fails_is_not_a_damaged_file(
+    home: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(self: object) -> None:
+        raise RuntimeError("no robot")
+
+    monkeypatch.setattr("gymnasium.envs.mujoco.inverted_pendulum_v5.InvertedPendulumEnv.reset_model", failing)
+    write(home / "local.hdf5", **still(600, rng))
+    with pytest.raises(OffbenchError, match=r"InvertedPendulum-v5.* failed: .*no robot"):
+        import_d4rl(home / "local.hdf5", "local-v0", env="inverted-pendulum")
+
+
 def test_a_dataset_without_an_environment_comes_back_the_same(home: Path) -> None:
     foreign("house-v0", [episode(3, 0, True), episode(5, 10, False)])
     import_d4rl(export("house-v0", home / "house.hdf5"), "back-v0")

@@ -150,6 +150,7 @@ def test_the_first_environment_is_on_record(home: Path, rng: np.random.Generator
     assert json.loads(metadata["env_spec"])["id"] == "Hopper-v2"
     assert json.loads(metadata["eval_env_spec"])["id"] == "Hopper-v5"
     ours = minari_store.read_provenance(metadata)
+    assert ours.contact_margin == "max"
     assert ours.d4rl == (-20.272305, 3234.3)
     assert len(ours.imported["sha256"]) == 64
     assert "ref_min_score" not in metadata  # D4RL's constants are of another environment than it is evaluated in

@@ -170,6 +170,10 @@ def test_the_hubs_card_says_what_the_data_are(medium: str, home: Path, capsys: p
     assert offbench.verify(medium, workers=1).ok  # a card in the folder is no fault
     main(["card", medium, "--huggingface", "--out", "card.md"])
     assert (home / "card.md").read_bytes() == path.read_bytes()
+    path.write_text(path.read_text().replace("viewer:", "license: mit\nviewer:").replace("| transitions | 600 |", ""))
+    _, header, text = offbench.huggingface_card(medium).read_text().split("---\n", 2)
+    assert yaml.safe_load(header)["license"] == "mit"
+    assert "| transitions | 600 |" in text
     with pytest.raises(OffbenchError, match="unknown dataset 'hoper-v0'"):
         offbench.huggingface_card("hoper-v0")
 

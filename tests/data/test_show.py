@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,6 +52,15 @@ def test_the_summary_by_hand(four_episodes: str) -> None:
         "provenance",
         "not recorded by offbench",
     ]
+
+
+def test_returns_that_differ_by_rounding_are_one_bar(home: Path) -> None:
+    sums = ([0.1, 0.2, 0.3], [0.3, 0.2, 0.1])
+    name = foreign("sums-v0", [episode(3, 0, True, rewards=np.array(rewards)) for rewards in sums])
+    summary = offbench.show(name)
+    assert summary.returns[0] != summary.returns[1]
+    assert [line.rsplit(maxsplit=1)[-1] for line in summary.lines() if " to " in line and "█" in line] == ["2"]
+    assert summary.plot(home / "sums.png").exists()
 
 
 def test_the_figure_by_hand(four_episodes: str, monkeypatch: pytest.MonkeyPatch) -> None:

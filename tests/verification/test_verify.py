@@ -93,6 +93,9 @@ def test_an_empty_sample_checks_all_but_the_environment(medium: str) -> None:
     report = verify(medium, episodes=0, workers=1)
     assert report.ok
     assert not any("played again" in line for line in report.checked)
+    for episodes in ("3", 2.5, -1):
+        with pytest.raises(offbench.OffbenchError, match="episodes must be a whole number from 0"):
+            verify(medium, episodes=episodes)  # type: ignore[arg-type]
 
 
 def shift_early(group: h5py.Group) -> None:
