@@ -9,7 +9,7 @@
     offbench.normalize()                                    # every run below ./runs
     offbench.report()                                       # the same as a page, report/index.html
 
-The command line (`offbench --help`) calls these same functions.
+The command line (`offbench --help`) has a command for each of these functions.
 """
 
 from __future__ import annotations

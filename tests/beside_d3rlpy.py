@@ -1,7 +1,7 @@
 """d3rlpy's TD3+BC, IQL, ReBRAC and BEAR on the data that ours have learned from: `python -m tests.beside_d3rlpy`,
 after `make bench` (which installs d3rlpy), writes docs/results/beside-d3rlpy.md.
 
-d3rlpy learns, in an environment of its own, from `offbench export --format npz`, with the settings of the grid
+d3rlpy learns, in an environment of its own, from an .npz file of `offbench export`, with the settings of the grid
 `baselines`, and hands its weights over as arrays; here they play as offbench policies, 10 episodes every 5,000 updates
 as in the grid. Two processes of one thread take some three hours; runs whose CSV file is below docs/results are not
 repeated.
@@ -208,7 +208,7 @@ def main() -> None:
     parser.add_argument("algorithms", nargs="*", default=ALGORITHMS, help=f"default: {' '.join(ALGORITHMS)}")
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
-    data = export(DATASET, args.folder / "data.npz", style="npz")
+    data = export(DATASET, args.folder / "data.npz")
     missing = [(name, seed) for name in args.algorithms for seed in range(SEEDS) if theirs(name, seed) is None]
     with ThreadPoolExecutor(2) as pool:
         for job in [pool.submit(learn_and_play, name, seed, data, args.folder) for name, seed in missing]:

@@ -91,7 +91,9 @@ class Comparison:
     def table(self) -> tuple[list[str], list[list[str]]]:
         """Return the header and the rows of a table of the pairs."""
         header = ["dataset", "seed", self.a, self.b, "difference"]
-        return header, [[p.dataset, str(p.seed), f"{p.a:.1f}", f"{p.b:.1f}", f"{p.a - p.b:+.1f}"] for p in self.pairs]
+        return header, [
+            [p.dataset, str(p.seed), f"{p.a:z.1f}", f"{p.b:z.1f}", f"{p.a - p.b:+z.1f}"] for p in self.pairs
+        ]
 
     def lines(self) -> list[str]:
         """Return the comparison as text."""

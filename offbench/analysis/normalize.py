@@ -136,13 +136,13 @@ def score_returns(env: str | Path, returns: Sequence[float]) -> list[Row]:
 
 
 def normalize(
-    runs: str | Path = "runs",
+    runs: str | Path | None = None,
     *,
     steps: int | None = None,
     env: str | Path | None = None,
     returns: float | Sequence[float] = (),
 ) -> list[Row]:
-    """Score all runs below a folder; or, with `env`, score one or several `returns` of that environment.
+    """Score all runs below a folder (default: runs); or, with `env`, one or several `returns` of that environment.
 
     With `steps`, the runs are scored as they were after so many updates (shorter ones as they are).
 
@@ -152,8 +152,8 @@ def normalize(
     if env is None:
         if returns:
             raise OffbenchError("returns need their environment: give --env, e.g. --env hopper 1234.5")
-        return score_runs(runs, steps)
-    for flag, given in (("steps", steps is not None), ("runs", str(runs) != "runs")):
+        return score_runs("runs" if runs is None else runs, steps)
+    for flag, given in (("steps", steps is not None), ("runs", runs is not None)):
         if given:
             raise OffbenchError(f"--{flag} has no effect with --env; leave it out")
     if not returns:
@@ -198,6 +198,7 @@ def render(rows: Sequence[Row], style: str = "table") -> str:
     keys = _shown(rows)
     header = [TITLES.get(key, key) or key for key in keys]
     cells = [[_cell(row, key) for key in keys] for row in rows]
+    names = sum(key in NAMES for key in keys)
     if style == "markdown":
         header, *cells = [[plain(text) for text in line] for line in [header, *cells]]
         return "\n".join(
@@ -206,8 +207,8 @@ def render(rows: Sequence[Row], style: str = "table") -> str:
     if style == "latex":
         header, *cells = [[latex(text) for text in line] for line in [header, *cells]]
         comments = (f"% note: {printable(' '.join(note.split()))}" for note in notes(rows))
-        return "\n".join([*tabular(header, cells, len(header)), *comments])
-    lines = aligned(header, cells, sum(key in NAMES for key in keys))
+        return "\n".join([*tabular(header, cells, names), *comments])
+    lines = aligned(header, cells, names)
     return "\n".join([*lines, *(f"note: {note}" for note in notes(rows))])
 
 
@@ -287,5 +288,5 @@ def _cell(row: Row, key: str, short: bool = False) -> str:
         count = compact if short else "{:,}".format
         return count(value) if value == row["of_steps"] else f"{count(value)} of {count(row['of_steps'])}"
     if isinstance(value, float):
-        return scores.plus_minus((value, row[f"{key}_std"])) if f"{key}_std" in row else f"{value:.1f}"
+        return scores.plus_minus((value, row[f"{key}_std"])) if f"{key}_std" in row else f"{value:z.1f}"
     return f"{value:,}" if isinstance(value, int) else str(value)

@@ -207,7 +207,10 @@ def read_results(
     if methods:
         every = tuple(dict.fromkeys(entry.method for entry in entries))
         wanted = {find_method(every, name) for name in methods}
-        entries, unevaluated = [entry for entry in entries if entry.method in wanted], []
+        entries = [entry for entry in entries if entry.method in wanted]
+        variants = {(method.algorithm, method.variant) for method in wanted}
+        configs = [(run, run.config()) for run in unevaluated]
+        unevaluated = [run for run, config in configs if (config.algorithm, config.variant) in variants]
     tasks = dict.fromkeys(entry.task for entry in entries)
     ordered = sorted({entry.method for entry in entries}, key=method_order)
     return Results(roots, tuple(tasks), tuple(ordered), {(e.task, e.method): e for e in entries}, tuple(unevaluated))

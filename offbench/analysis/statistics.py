@@ -35,11 +35,11 @@ class Estimate:
     high: float | None = None
 
     def __str__(self) -> str:
-        return f"{self.value:.1f} {self.span()}".rstrip()
+        return f"{self.value:z.1f} {self.span()}".rstrip()
 
     def span(self) -> str:
         """Return `[low, high]`, empty without an interval."""
-        return "" if self.low is None or self.high is None else f"[{self.low:.1f}, {self.high:.1f}]"
+        return "" if self.low is None or self.high is None else f"[{self.low:z.1f}, {self.high:z.1f}]"
 
     def __neg__(self) -> Estimate:
         low, high = (None if end is None else -end for end in (self.high, self.low))

@@ -66,13 +66,24 @@ def notices(config: type, settings: Mapping[str, object]) -> Iterator[str]:
                 yield text
 
 
-def moved_flag(algorithm: str, words: list[str]) -> str | None:
-    """Return the first flag that bdb had in earlier versions and bdb_plus has now; None if there is none."""
+def moved_flag(algorithm: str, named_settings: Mapping[str, object], words: list[str]) -> str | None:
+    """Return the first flag that bdb had in earlier versions and bdb_plus has now; None if there is none.
+
+    Args:
+        named_settings: the settings in the method's name, which count as flags: `bdb (learned)`.
+    """
     from offbench.training.former_settings import MOVED
 
     if algorithm != "bdb":
         return None
-    if {"learned", "--beta=learned"} & set(words):
+    if named_settings.get("beta") == ["learned"]:
         return "--beta learned"
-    moved = {f"--{name.replace('_', '-')}" for name in MOVED}
-    return next((flag for flag in (word.partition("=")[0] for word in words) if flag in moved), None)
+    moved, flag = {f"--{name.replace('_', '-')}" for name in MOVED}, ""
+    for word in words:
+        name, _, value = word.partition("=")
+        flag = name if word.startswith("--") else flag
+        if flag in moved:
+            return flag
+        if flag == "--beta" and "learned" in (word, value):
+            return "--beta learned"
+    return None

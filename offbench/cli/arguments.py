@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import re
 import shutil
@@ -28,7 +29,7 @@ class Parser(argparse.ArgumentParser):
     help_command = ""
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__(formatter_class=_Formatter, **kwargs)
+        super().__init__(formatter_class=_Formatter, allow_abbrev=False, **kwargs)
         self._positionals.title = "arguments"
         self.color = False  # Python 3.14 would color the help, too
         self._negative_number_matcher = re.compile(r"-\.?\d[\d_.]*(e[+-]?\d+)?$", re.IGNORECASE)  # also -1e3
@@ -40,7 +41,7 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Report unknown flags before missing arguments, by the parser that has the flags."""
         if self._subparsers is None:
-            for word in args:
+            for word in itertools.takewhile(lambda word: word != "--", args):
                 self._check_flag(word.partition("=")[0])
         parsed, rest = super().parse_known_args(args, namespace)
         if rest:
@@ -49,7 +50,7 @@ class Parser(argparse.ArgumentParser):
 
     def _check_flag(self, flag: str) -> None:
         flags = [name for name in self._option_string_actions if name.startswith("--")]
-        if not flag.startswith("--") or any(name.startswith(flag) for name in flags):  # argparse takes abbreviations
+        if not flag.startswith("--") or flag in flags:
             return
         near = nearest(flag[2:], [name[2:] for name in flags])
         hint = f": did you mean --{near}?" if near else ""
@@ -180,12 +181,12 @@ def _whole(text: str, least: int) -> int:
 
 
 def shard(text: str) -> tuple[int, int]:
-    """Return (i, n) of `i/n`."""
+    """Return (i, n) of `I/N`."""
     first, slash, last = text.partition("/")
     if not slash:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a share such as 0/4")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a part I/N such as 0/4")
     if non_negative_int(first) >= positive_int(last):
-        raise argparse.ArgumentTypeError(f"a shard is i/n with i from 0 to n - 1, not {text}")
+        raise argparse.ArgumentTypeError(f"a part is I/N with I from 0 to N-1, not {text}")
     return non_negative_int(first), positive_int(last)
 
 

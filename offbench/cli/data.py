@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from json import dumps
 from typing import Any
@@ -25,7 +26,6 @@ def collect_arguments(parser: Parser, _: list[str]) -> None:
     _env(parser, "a shipped environment (see `offbench list`) or a recipe file")
     level = parser.add_argument(
         "--level",
-        default="medium",
         help="a level, or a fraction of the expert's normalized return such as 0.6 (default: medium)",
     )
     complete_with(level, levels)
@@ -99,7 +99,10 @@ def _dataset(parser: Parser) -> None:
 
 def _behaviour_dir(parser: Parser) -> None:
     parser.add_argument(
-        "--behaviour-dir", default="behaviour", metavar="DIR", help="folder of behaviour agents (default: behaviour)"
+        "--behaviour-dir",
+        default=argparse.SUPPRESS,
+        metavar="DIR",
+        help="folder of behaviour agents (default: behaviour)",
     )
 
 
@@ -115,7 +118,7 @@ def list_arguments(parser: Parser, _: list[str]) -> None:
 
         if runs is not None and what != "runs":
             parser.error("--runs has an effect only in `offbench list runs`")
-        contents = offbench.inventory(what, runs=runs or "runs")
+        contents = offbench.inventory(what, **({} if runs is None else {"runs": runs}))
         if json:
             print(dumps(contents, indent=1))
             return
@@ -162,15 +165,15 @@ def card_arguments(parser: Parser, _: list[str]) -> None:
     )
     _behaviour_dir(parser)
 
-    def run(about: str, huggingface: bool, out: str | None, behaviour_dir: str) -> None:
+    def run(about: str, huggingface: bool, out: str | None, **agents: str) -> None:
         if huggingface:
-            if behaviour_dir != parser.get_default("behaviour_dir"):
+            if agents:
                 parser.error("--behaviour-dir has no effect with --huggingface")
             print(f"saved {offbench.huggingface_card(about, out)}")
         elif about in local_datasets():
             parser.error(f"{about} is a dataset: give --huggingface, or an environment")
         else:
-            print(f"saved {offbench.card(about, out, behaviour_dir)}")
+            print(f"saved {offbench.card(about, out, **agents)}")
 
     parser.set_defaults(run=run)
 
@@ -219,18 +222,13 @@ def import_arguments(parser: Parser, _: list[str]) -> None:
 def export_arguments(parser: Parser, _: list[str]) -> None:
     """Add the arguments of `export`."""
     _dataset(parser)
-    parser.add_argument("--out", required=True, metavar="FILE", help="the file to write: .hdf5 (D4RL) or .npz")
     parser.add_argument(
-        "--format",
-        choices=("d4rl", "npz"),
-        dest="style",
-        metavar="FORMAT",
-        help="d4rl or npz (default: by the file's ending)",
+        "--out", required=True, metavar="FILE", help="the file to write: .hdf5 (D4RL) or .npz (arrays)"
     )
     parser.add_argument(
         "--drop-timeouts",
         action="store_true",
-        help="npz: drop the steps at timeouts, as D4RL's qlearning_dataset does",
+        help=".npz only: drop the steps at timeouts, as D4RL's qlearning_dataset does",
     )
 
     parser.set_defaults(run=lambda **options: print(f"saved {offbench.export(**options)}"))

@@ -32,7 +32,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
             ],
         ),
         "list": Command(
-            "list environments, levels, algorithms, local datasets and runs",
+            "list environments, levels, algorithms and datasets, or runs",
             data.list_arguments,
             ["list", "list runs", "list datasets --json"],
         ),
@@ -326,7 +326,7 @@ class _MainParser(Parser):
 def _parser(words: list[str]) -> Parser:
     """Return the parser for a command line; only the command that runs gets its arguments, which take time to load."""
     parser = _MainParser(prog="offbench", description="Record offline-RL datasets and benchmark algorithms on them.")
-    version = _version() if any(word.startswith("--v") for word in words) else ""  # it takes a while to read
+    version = _version() if "--version" in words else ""  # it takes a while to read
     parser.add_argument("--version", action="version", version=version)
     commands = parser.add_subparsers(prog="offbench", dest="command", metavar="COMMAND", parser_class=Parser)
     name = _command(words)

@@ -38,7 +38,7 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
         parser.add_argument("--env", metavar="ENV", help="environment of the returns: a shipped one or a recipe file"),
         recipes,
     )
-    parser.add_argument("--runs", default="runs", metavar="DIR", help=RUNS_HELP)
+    parser.add_argument("--runs", metavar="DIR", help=RUNS_HELP)
     parser.add_argument("--steps", type=positive_int, metavar="N", help=STEPS_HELP)
     parser.add_argument(
         "--format",
@@ -52,20 +52,23 @@ def normalize_arguments(parser: Parser, _: list[str]) -> None:
 
     def run(style: str, plot: str | None, **arguments: Any) -> None:
         from offbench.analysis.normalize import without_evaluation
+        from offbench.common.plotting import picture_file
 
         if plot and arguments["env"]:
             raise OffbenchError("--plot has no effect with --env; leave it out")
+        if plot:
+            picture_file(plot)
         print_scores(offbench.normalize(**arguments), style)
-        waiting, diverged = (0, 0) if arguments["env"] else without_evaluation(arguments["runs"], arguments["steps"])
+        runs, steps = arguments["runs"] or "runs", arguments["steps"]
+        waiting, diverged = (0, 0) if arguments["env"] else without_evaluation(runs, steps)
         if waiting:
-            when = f"within {arguments['steps']:,} updates" if arguments["steps"] else "yet"
-            note(f"{counted(waiting, 'run')} without an evaluation {when}")
+            note(f"{counted(waiting, 'run')} without an evaluation {f'within {steps:,} updates' if steps else 'yet'}")
         if diverged:
             note(f"{counted(diverged, 'run')} diverged before the first evaluation")
         if plot:
             from offbench.reports.figures import plot_curves
 
-            print(f"saved {plot_curves(arguments['runs'], plot, arguments['steps'])}", file=sys.stderr)
+            print(f"saved {plot_curves(runs, plot, steps)}", file=sys.stderr)
 
     parser.set_defaults(run=run)
 
@@ -177,11 +180,13 @@ def _print_similarity(paths: list[str], **options: Any) -> None:
     """Print the similar score of each run; of several, those of algorithms without a critic are left out."""
     from offbench.evaluation.similarity import NoCriticError, similarity
 
+    left_out = 0
     for path in paths:
         try:
             result = similarity(path, **options)
         except NoCriticError as error:
-            if len(paths) == 1:
+            left_out += 1
+            if left_out == len(paths):
                 raise
             note(f"left out: {error}")
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import shlex
 from typing import Any
 
@@ -24,7 +25,7 @@ from offbench.common.settings import fields
 from offbench.common.terminal import hint, note, print_lines
 from offbench.common.text import without_steps
 
-SWITCHES = ("--tensorboard", "--trust", "--fresh", "--download")  # flags of `train` that take no value
+SWITCHES = ("--tensorboard", "--trust", "--fresh", "--download", "--")  # flags of `train` that take no value
 
 
 def train_arguments(parser: Parser, words: list[str]) -> None:
@@ -63,7 +64,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         parser.epilog = f"`offbench train ALGO --help` shows an algorithm's own settings.\n\n{parser.epilog}"
         parser.set_defaults(run=lambda **_: parser.error("name the algorithm first: offbench train ALGO --dataset ID"))
         return
-    moved = moved_flag(algorithm, words)
+    moved = moved_flag(algorithm, named_settings, words)
     algorithm = "bdb_plus" if moved else algorithm
     parser.help_command = f"offbench train {algorithm}"
     config = add_settings(parser, algorithm)
@@ -74,6 +75,9 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
 
         settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
         rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
+        for name in named_settings:
+            if name in settings or name in rest:
+                raise OffbenchError(f"{name} is part of the method's name and of the flags; leave one out")
         rest["algorithm"], settings = algorithm, named_settings | settings
         if "precision" in named_settings:  # part of a method's name, but not a setting
             (rest["precision"],) = settings.pop("precision")
@@ -90,8 +94,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         if any(Run(folder).evaluations() for folder in folders):
             hint("offbench", "normalize", *([] if rest["runs"] == "runs" else ["--runs", rest["runs"]]))
         else:
-            note("the dataset names no environment to evaluate in: evaluate the runs with --env RECIPE")
-            hint("offbench", "evaluate", str(folders[0]), "--env", "RECIPE")
+            note("the dataset names no environment to evaluate in; give one to `offbench evaluate RUN --env ENV`")
 
     parser.set_defaults(run=run)
 
@@ -102,7 +105,7 @@ def _find_algorithm(words: list[str]) -> tuple[str | None, dict[str, Any]]:
     A method's name from a table is understood: `bdb (beta=0.5)` is bdb with beta 0.5.
     """
     for before, word in zip(["", *words], words, strict=False):
-        taken = before.startswith("--") and "=" not in before and not any(s.startswith(before) for s in SWITCHES)
+        taken = before.startswith("--") and "=" not in before and before not in SWITCHES
         if not taken and not word.startswith("-"):
             name, bracket, rest = without_steps(word).partition(" (")
             parts = [part.strip() for part in rest.removesuffix(")").split(",")] if bracket else []
@@ -136,7 +139,7 @@ def _machine(parser: Parser) -> None:
     )
     parser.add_argument(
         "--precision",
-        default="float32",
+        default=argparse.SUPPRESS,
         metavar="TYPE",
         help="precision of matrix multiplications: float32, tf32 (GPUs) or bfloat16 (default: float32)",
     )
@@ -159,7 +162,6 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
     parser.add_argument(
         "--executor",
         choices=("local", "ray"),
-        default="local",
         metavar="NAME",
         help="where to train: local or ray (default: local)",
     )
@@ -172,13 +174,16 @@ def benchmark_arguments(parser: Parser, words: list[str]) -> None:
         plan: bool,
         budget: str | None,
         shard: tuple[int, int],
-        executor: str,
+        executor: str | None,
         address: str | None,
         **arguments: Any,
     ) -> None:
         from offbench.analysis import normalize
         from offbench.benchmarks.plan import prepare, write_plan
 
+        for name, value in (("budget", budget), ("executor", executor), ("address", address)):
+            if plan and value:
+                raise OffbenchError(f"--{name} has no effect with --plan; leave it out")
         if address and executor != "ray":
             raise OffbenchError("--address needs --executor ray")
         if plan:

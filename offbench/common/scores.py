@@ -72,4 +72,4 @@ def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
 def plus_minus(mean_and_std: tuple[float, float | None]) -> str:
     """Return `mean ± std`; one seed has no spread, which is not a spread of 0: `mean ± ?`."""
     mean, std = mean_and_std
-    return f"{mean:.1f} ± " + ("?" if std is None else f"{std:.1f}")
+    return f"{mean:z.1f} ± " + ("?" if std is None else f"{std:.1f}")

@@ -237,7 +237,7 @@ def _cells(level: str, values: JsonObject) -> list[str]:
 
 
 def _short(value: float | None) -> str:
-    return "-" if value is None else f"{round(value, 1) + 0.0:,.1f}"  # + 0.0: no -0.0
+    return "-" if value is None else f"{value:z,.1f}"
 
 
 def _draw(recipe: Recipe, ladder: Ladder, levels: Mapping[str, Summary], path: Path) -> None:

@@ -36,7 +36,7 @@ REPOSITORY = "https://github.com/offbench/offbench"
 
 def collect(
     env: str | Path,
-    level: str | float = "medium",
+    level: str | float | None = None,
     *,
     mix: str | None = None,
     steps: int | None = None,
@@ -54,7 +54,7 @@ def collect(
 
     Args:
         env: a shipped recipe's name (`hopper`) or a recipe file (`./my-env.toml`).
-        level: random, medium, medium-replay, medium-expert, expert, or a fraction such as 0.6.
+        level: random, medium (the default), medium-replay, medium-expert, expert, or a fraction such as 0.6.
         mix: a mix of levels instead of one level, e.g. "random:0.5,expert:0.5".
         steps: transitions; default: the recipe's (1,000,000 per part; medium-replay: all of the training's).
         seed: seed of the episodes. The same seed gives the same content for any number of workers.
@@ -76,16 +76,17 @@ def collect(
     Raises:
         OffbenchError: anything that the user can fix, in one line.
     """
-    recipe, level, seed = load_recipe(env), str(level), check_seed(seed)
+    recipe, seed = load_recipe(env), check_seed(seed)
     policy_source = None
     if policy is None:
         if name is not None:
             raise OffbenchError("--name goes with --policy; give a dataset's id by --id")
-        if mix is not None and level != "medium":
+        if mix is not None and level is not None:
             raise OffbenchError("give --level or --mix, not both")
+        level = mix or ("medium" if level is None else str(level))
         name, parts = parse_mix(mix) if mix is not None else parse_level(level)
     else:
-        if mix is not None or level != "medium":
+        if mix is not None or level is not None:
             raise OffbenchError("--policy records one policy: leave out --level and --mix")
         if accept:
             raise OffbenchError("--accept is about the policy that --level or --mix chooses; --policy records its own")
@@ -102,7 +103,7 @@ def collect(
     # with --retrain, a level without an agent still has the references of one
     has_agent = ladder is not None or (not retrain and all(part.source in WITHOUT_AGENT for part in parts))
     recording = recording_with(ladder) if has_agent else None
-    if recording and not overwrite and _is_recorded(recording, dataset_id, mix or level):
+    if recording and not overwrite and _is_recorded(recording, dataset_id, level):
         if recording.calls_function:
             raise OffbenchError(
                 f"{dataset_id} is recorded already, but {policy} may act differently now (a function can read files); "
@@ -115,7 +116,7 @@ def collect(
         if recording is None:
             ladder = _train(env, Path(behaviour_dir), workers)
             recording = recording_with(ladder)
-        metadata = _metadata(recording, dataset_id, mix or level)
+        metadata = _metadata(recording, dataset_id, level)
         total = sum(recording.counts)
         with Progress(total, f"recording {dataset_id}") as progress:
             episodes = _counted(recording.episodes(), progress)

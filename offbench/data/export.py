@@ -9,6 +9,7 @@ npz    float32, the keys of D4RL's qlearning_dataset: what their replay buffers 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import tempfile
@@ -43,26 +44,25 @@ ATTRIBUTE = 60_000  # bytes that HDF5 lets an attribute have
 Columns = dict[str, Array]
 
 
-def export(dataset_id: str, out: str | Path, *, style: str | None = None, drop_timeouts: bool = False) -> Path:
+def export(dataset_id: str, out: str | Path, *, drop_timeouts: bool = False) -> Path:
     """Write a local Minari dataset with flat Box spaces to one file for other programs.
 
     Args:
         dataset_id: its id.
-        out: the file; an existing one is replaced at the end.
-        style: d4rl or npz (default: as the file ends, .hdf5 or .npz).
-        drop_timeouts: npz only: leave out the steps at a timeout, as D4RL's qlearning_dataset does. (It also never
+        out: the file, .hdf5 (D4RL) or .npz; an existing one is replaced at the end.
+        drop_timeouts: .npz only: leave out the steps at a timeout, as D4RL's qlearning_dataset does. (It also never
             reads a file's very last row; one that terminates is kept here.)
 
     Returns:
         The file.
 
     Raises:
-        OffbenchError: no such dataset, other spaces, damaged data, a file that ends otherwise than its format, no such
-            folder, the disk refuses, or the dataset was replaced meanwhile.
+        OffbenchError: no such dataset, other spaces, damaged data, a file with another ending, no such folder, the
+            disk refuses, or the dataset was replaced meanwhile.
     """
-    style = _style(Path(out), style)
+    style = _format(Path(out))
     if drop_timeouts and style == "d4rl":
-        raise OffbenchError("--drop-timeouts goes with --format npz: readers of D4RL files drop them")
+        raise OffbenchError("--drop-timeouts needs an .npz file: readers of D4RL files drop the steps themselves")
     path = output_file(out)
     with write_errors(str(path)), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         temporary = Path(folder) / path.name
@@ -91,15 +91,13 @@ def _write(dataset_id: str, path: Path, style: str, drop_timeouts: bool) -> None
     minari_store.check_content(dataset_id, metadata, content.hexdigest())
 
 
-def _style(out: Path, style: str | None) -> str:
-    """Return the format, asked for or as the file's name ends. Raises OffbenchError if the two do not fit."""
-    if style not in (None, *FORMATS):
-        raise OffbenchError(f"a format is one of {', '.join(FORMATS)}, not {style!r}")
-    by_name = next((name for name, endings in FORMATS.items() if out.suffix.lower() in endings), None)
-    if by_name is None or style not in (None, by_name):
-        wanted = " or ".join(ending for name in FORMATS if style in (None, name) for ending in FORMATS[name])
-        raise OffbenchError(f"cannot write {out.name!r}: {f'{style} files' if style else 'exports'} end in {wanted}")
-    return by_name
+def _format(out: Path) -> str:
+    """Return the format that a file's name ends in. Raises OffbenchError for another ending."""
+    for name, endings in FORMATS.items():
+        if out.suffix.lower() in endings:
+            return name
+    wanted = " or ".join(itertools.chain(*FORMATS.values()))
+    raise OffbenchError(f"cannot write {out.name!r}: exports end in {wanted}")
 
 
 def _columns(data: MinariDataset, dataset_id: str, progress: Progress, content: ContentHash) -> Iterator[Columns]:

@@ -99,7 +99,7 @@ def _content(summary: Summary) -> dict[str, str]:
     if references := minari_store.references(meta):
         low, high = references
         facts["reference returns"] = f"{low:.1f} (score 0), {high:.1f} (score 100)"
-        facts["normalized score of the data"] = f"{normalize(mean, low, high):.1f}"
+        facts["normalized score of the data"] = f"{normalize(mean, low, high):z.1f}"
     if meta.get("algorithm_name"):
         facts["behaviour policy"] = str(meta["algorithm_name"])
     return facts

@@ -44,7 +44,7 @@ class Summary:
         if references := minari_store.references(meta):
             low, high = references
             score = normalize(float(self.returns.mean()), low, high)
-            lines.append(f"references      random {low:.1f}, expert {high:.1f}: normalized mean return {score:.1f}")
+            lines.append(f"references      random {low:.1f}, expert {high:.1f}: normalized mean return {score:z.1f}")
         lines += ["", *_histogram(self.returns), ""]
         lines.append("provenance")
         for part in provenance.parts or ():

@@ -58,7 +58,7 @@ class Evaluation:
             f"return {mean:.1f}{spread}, length {np.mean(self.lengths):.0f}",
         ]
         names = {"dataset": "own reference: random and expert of this environment", "d4rl": "D4RL's constants"}
-        return lines + [f"normalized score {score:.1f} ({names[key]})" for key, score in self.scores.items()]
+        return lines + [f"normalized score {score:z.1f} ({names[key]})" for key, score in self.scores.items()]
 
 
 def evaluate(

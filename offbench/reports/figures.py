@@ -70,7 +70,7 @@ class Figure:
 
 
 def line_styles(methods: Sequence[Method]) -> dict[Method, LineStyle]:
-    """Return color and dashes of each method; sixteen methods and more repeat colors with other dashes."""
+    """Return color and dashes of each method; more methods than colors repeat the colors with other dashes."""
     return {
         method: LineStyle(method.label, COLORS[i % len(COLORS)], DASHES[(i + i // len(COLORS)) % len(DASHES)])
         for i, method in enumerate(methods)
@@ -176,7 +176,9 @@ def profile_figure(aggregates: Aggregates, styles: Mapping[Method, LineStyle]) -
     halves = {m.label: profile(s, [50.0])[0].value for m, (_, s) in aggregates.items()}
     text = ", ".join(f"{label} {100 * half:.0f}%" for label, half in halves.items())
     caption = "Fraction of all runs that score above τ, 95% stratified bootstrap interval shaded. Higher is better."
-    return _draw("profiles", caption, f"Performance profiles. Runs above 50: {text}.", paint, list(styles.values()))
+    return _draw(
+        "profiles", caption, f"Performance profiles. Runs above 50: {text}.", paint, [styles[m] for m in aggregates]
+    )
 
 
 def iqm_curve_figure(results: Results, styles: Mapping[Method, LineStyle]) -> Figure | None:

@@ -7,6 +7,7 @@ import hashlib
 import importlib.resources
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from offbench.analysis.results import REFERENCES, Entry, Results
 from offbench.common.scores import run_return
@@ -187,8 +188,8 @@ def _seeds(results: Results, entry: Entry) -> Markup:
         cells = [
             str(run.seed),
             f"{score:.2f}" if entry.task.reference else "-",
-            f"{run_return(run.evaluations):.1f}",
-            str(len(run.evaluations)),
+            f"{run_return(run.evaluations):z.1f}",
+            str(len(run.window)),
             step,
         ]
         folder = tag("td", breakable(relative(results, run.files)), class_="name")
@@ -201,7 +202,17 @@ def relative(results: Results, run: Run) -> str:
     """Return a run's folder as seen from the folder of all runs, so that a page does not name its machine."""
     root = next(root for root in results.roots if run.folder.is_relative_to(root))
     inside = run.folder.relative_to(root)
-    return (inside if len(results.roots) == 1 else root.name / inside).as_posix()
+    return (inside if len(results.roots) == 1 else _short_names(results.roots)[root] / inside).as_posix()
+
+
+def _short_names(roots: Sequence[Path]) -> dict[Path, Path]:
+    """Return the last parts of each folder, as many as tell the folders apart."""
+    parts = [root.resolve().parts for root in roots]
+    for count in range(1, max(map(len, parts)) + 1):
+        names = [Path(*path[-count:]) for path in parts]
+        if len(set(names)) == len(set(parts)):
+            break
+    return dict(zip(roots, names, strict=True))
 
 
 def _key_values(values: Mapping[str, object]) -> str:

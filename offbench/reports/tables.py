@@ -292,13 +292,15 @@ def improvement_table(results: Results, aggregates: Aggregates) -> Table:
     """Return the probability that a run of the row's method beats one of the column's, over their common tasks."""
     methods = list(aggregates)
     chances: dict[tuple[Method, Method], Estimate] = {}
+    better: set[tuple[Method, Method]] = set()
     for i, a in enumerate(methods):
         for b in methods[i + 1 :]:
             if set(aggregates[a][1]) & set(aggregates[b][1]):
                 chances[a, b] = estimate = improvement(aggregates[a][1], aggregates[b][1])
                 ends = (None if end is None else 1 - end for end in (estimate.high, estimate.low))
                 chances[b, a] = Estimate(1 - estimate.value, *ends)
-    better = {pair for pair in chances if _better(results, *pair)}
+                sign = _favored(results, a, b)
+                better |= {(a, b)} if sign > 0 else {(b, a)} if sign < 0 else set()
     rows = [[Cell(a.label), *[_chance(chances.get((a, b)), (a, b) in better) for b in methods]] for a in methods]
     notes = [
         "Probability in percent that a run of the row's method scores above one of the column's, averaged over the "
@@ -311,11 +313,11 @@ def improvement_table(results: Results, aggregates: Aggregates) -> Table:
     return Table("improvement", title, ["row above column", *[method.label for method in methods]], rows, notes)
 
 
-def _better(results: Results, a: Method, b: Method) -> bool:
-    """Return whether `compare` finds A better, on the tasks that have scores."""
+def _favored(results: Results, a: Method, b: Method) -> int:
+    """Return 1 if `compare` finds A better on the tasks that have scores, -1 for B, 0 for no evidence."""
     groups = ([entry for entry in results.of(method) if entry.task.reference] for method in (a, b))
     both = pair_runs(*groups)
-    return bool(both) and comparable(both) and favored(paired(differences(both))) > 0
+    return favored(paired(differences(both))) if both and comparable(both) else 0
 
 
 def _chance(estimate: Estimate | None, better: bool) -> Cell:

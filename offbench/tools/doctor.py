@@ -15,19 +15,16 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from offbench.agents.medium_replay import load_replay
-from offbench.common.arrays import Array
 from offbench.common.errors import OffbenchError
 from offbench.common.files import read_json
 from offbench.common.processes import cores
 from offbench.common.provenance import hardware, versions
-from offbench.data import minari_store, transitions
-from offbench.envs.environments import make_env, spaces_of
-from offbench.envs.recipes import load_recipe
-from offbench.rollouts.rollouts import Episode
+
+if TYPE_CHECKING:  # each check imports what it needs, which may be broken
+    from offbench.common.arrays import Array
+    from offbench.rollouts.rollouts import Episode
 
 OK, NOTE, BROKEN = "ok", "note", "broken"
 REPLAYED = 64  # transitions of the physics check
@@ -55,9 +52,6 @@ class Finding:
     state: str
     text: str
 
-    def __str__(self) -> str:
-        return f"{self.name:<12}{self.state:<8}{self.text}"
-
 
 def doctor() -> list[Finding]:
     """Look at this installation and machine; nothing is changed and nothing raises."""
@@ -67,8 +61,8 @@ def doctor() -> list[Finding]:
         "gpu": _gpu,
         "physics": _physics,
         "algorithms": _algorithms,
-        "datasets": lambda: _writable(minari_store.root(), "MINARI_DATASETS_PATH"),
-        "cache": lambda: _writable(transitions.cache(), "OFFBENCH_CACHE"),
+        "datasets": _datasets,
+        "cache": _cache,
         "runs": lambda: _writable(Path.cwd(), ""),
         "renderer": _renderer,
         "extras": _extras,
@@ -84,9 +78,16 @@ def _safely(check: Callable[[], Iterator[tuple[str, str]]]) -> list[tuple[str, s
 
 
 def _versions() -> Iterator[tuple[str, str]]:
-    packages = versions()
+    packages = versions() | {"h5py": _version("h5py")}
     missing = [name for name, version in packages.items() if version == "not installed"]
     yield BROKEN if missing else OK, ", ".join(f"{name} {version}" for name, version in packages.items())
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def _machine() -> Iterator[tuple[str, str]]:
@@ -128,6 +129,12 @@ def replay_error(count: int) -> float:
     Raises:
         OffbenchError: the shipped data are missing or damaged.
     """
+    import numpy as np
+
+    from offbench.agents.medium_replay import load_replay
+    from offbench.envs.environments import make_env, spaces_of
+    from offbench.envs.recipes import load_recipe
+
     recipe = load_recipe("hopper")
     env, folder = make_env(recipe.env_spec()).unwrapped, recipe.folder
     assert folder is not None
@@ -146,6 +153,8 @@ def replay_error(count: int) -> float:
 
 def _sample_transitions(episodes: Iterator[Episode], count: int) -> Iterator[tuple[Array, Array, Array]]:
     """Yield (observation, action, next observation), one from the middle of every eighth episode."""
+    import numpy as np
+
     yielded = 0
     for number, episode in enumerate(episodes):
         step = len(episode) // 2
@@ -161,14 +170,29 @@ def _sample_transitions(episodes: Iterator[Episode], count: int) -> Iterator[tup
 def _algorithms() -> Iterator[tuple[str, str]]:
     from offbench.training.registry import algorithm_names, load_algorithm
 
-    loaded = []
-    for name in algorithm_names():
+    names, loaded = algorithm_names(), []
+    for name in names:
         try:
             load_algorithm(name)
             loaded.append(name)
         except OffbenchError as error:
             yield BROKEN, str(error)
-    yield (OK, ", ".join(loaded)) if loaded else (BROKEN, "none is registered; install the package: pip install .")
+    if loaded:
+        yield OK, ", ".join(loaded)
+    elif not names:
+        yield BROKEN, "none is registered; install the package: pip install ."
+
+
+def _datasets() -> Iterator[tuple[str, str]]:
+    from offbench.data import minari_store
+
+    return _writable(minari_store.root(), "MINARI_DATASETS_PATH")
+
+
+def _cache() -> Iterator[tuple[str, str]]:
+    from offbench.data import transitions
+
+    return _writable(transitions.cache(), "OFFBENCH_CACHE")
 
 
 def _writable(folder: Path, variable: str) -> Iterator[tuple[str, str]]:
@@ -196,7 +220,7 @@ def _renderer() -> Iterator[tuple[str, str]]:
 
 def _extras() -> Iterator[tuple[str, str]]:
     for module, purpose in EXTRAS.items():
-        try:
-            yield OK, f"{module} {importlib.metadata.version(module)}"
-        except importlib.metadata.PackageNotFoundError:
-            yield NOTE, f"{module} is not installed ({purpose})"
+        version = _version(module)
+        yield (
+            (NOTE, f"{module} is {version} ({purpose})") if version == "not installed" else (OK, f"{module} {version}")
+        )

@@ -21,18 +21,19 @@ if TYPE_CHECKING:
     from offbench.training.run_config import RunConfig
 
 
-def inventory(what: str | None = None, *, runs: str | Path = "runs") -> JsonObject:
+def inventory(what: str | None = None, *, runs: str | Path | None = None) -> JsonObject:
     """Return the available environments, levels, algorithms, datasets and runs.
 
     Args:
         what: `environments` (with their shipped ladders), `levels`, `algorithms`, `datasets` (local ones) or `runs`;
             None for all but the runs.
-        runs: the folder of the runs. A run's `step` is the newest that was evaluated, or that of its newest checkpoint
-            if none was; `score` and `d4rl_score` are those of `offbench.normalize`, None without such a reference.
+        runs: the folder of the runs (default: runs). A run's `step` is the newest that was evaluated, or that of its
+            newest checkpoint if none was; `score` and `d4rl_score` are those of `offbench.normalize`, None without
+            such a reference.
 
     Raises:
-        OffbenchError: an unknown `what`, or a duplicated run. Damaged runs are named on stderr and left
-            out.
+        OffbenchError: an unknown `what`, no such folder of runs, or a duplicated run. Damaged runs are named on
+            stderr and left out.
     """
     parts: dict[str, Callable[[], object]] = {
         "environments": _environments,
@@ -80,14 +81,15 @@ def _warn_of_unreadable(error: OSError) -> None:
         warn(f"left out: cannot read {error.filename}: {error.strerror}; check its permissions")
 
 
-def _runs(root: str | Path) -> list[JsonObject]:
+def _runs(folder: str | Path | None) -> list[JsonObject]:
     from offbench.analysis.methods import method_of
     from offbench.analysis.results import entries_of
     from offbench.training.run import find_runs
 
-    if Path(root).exists() and not Path(root).is_dir():
+    root = Path("runs" if folder is None else folder)
+    if not root.is_dir() and (folder is not None or root.exists()):
         raise OffbenchError(f"{root} is not a folder of runs")
-    entries, unevaluated = entries_of(find_runs(Path(root)), compared=False)
+    entries, unevaluated = entries_of(find_runs(root), compared=False)
     rows = [
         _run(entry.task.name, entry.method.label, run.files, run.config, run)
         for entry in entries
@@ -152,7 +154,7 @@ def _run_section(runs: Sequence[JsonObject]) -> Section:
     rows = [
         [
             *(run["dataset"], run["method"], str(run["seed"]), f"{run['step']:,}", f"{run['steps']:,}"),
-            *("-" if run[key] is None else f"{run[key] + 0.0:.1f}" for key in scores),
+            *("-" if run[key] is None else f"{run[key]:z.1f}" for key in scores),
             run["state"],
         ]
         for run in runs

@@ -264,4 +264,4 @@ class Trainer:
         references = self.stack.data[0].references
         if references is None:
             return f"return {np.mean(means):.0f} at step {step:,}"
-        return f"score {np.mean([normalize(mean, *references) for mean in means]):.1f} at step {step:,}"
+        return f"score {np.mean([normalize(mean, *references) for mean in means]):z.1f} at step {step:,}"

@@ -18,7 +18,7 @@ from offbench.evaluation.similarity import similarity
 from offbench.rollouts.policy import read_policy_file
 from offbench.training.restore import restore
 from offbench.training.run import Run
-from tests.data.test_transitions import episode, foreign
+from tests.made_datasets import episode, foreign
 
 SMALL: dict[str, Any] = {"hidden": (32, 32), "batch_size": 64, "eval_every": 500, "eval_episodes": 2}
 
@@ -86,6 +86,9 @@ def test_similarity_on_the_command_line(medium: str, capsys: pytest.CaptureFixtu
     assert folders[0] in out
     assert "(within 0% of |Q1(s, a)|)" in out
     assert f"left out: {bc}: bc has no critic" in " ".join(err.split())
+    with pytest.raises(SystemExit) as stopped:
+        main(["evaluate", str(bc), str(bc), "--similarity"])
+    assert stopped.value.code == 2
 
 
 def test_similarity_needs_a_critic_and_its_dataset(tiny: tuple[str, str], medium: str) -> None:

@@ -16,7 +16,7 @@ from offbench.training.batches import StackData
 from offbench.training.spec import RunSpec
 from tests.algorithm.references import networks
 from tests.algorithm.test_cpu_capture import Plain, stack_of, trained
-from tests.data.test_transitions import episode, foreign
+from tests.made_datasets import episode, foreign
 
 
 def network(**options: Any) -> Network:

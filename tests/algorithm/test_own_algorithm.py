@@ -24,7 +24,7 @@ from offbench.training.datasets import load_datasets
 from offbench.training.registry import algorithm_names, load_algorithm
 from offbench.training.spec import TrainingSchedule, specs_of
 from offbench.training.stack import Stack
-from tests.cli.test_bad_input import refusal
+from tests.commands import refusal
 
 
 def own(**parts: Any) -> type:

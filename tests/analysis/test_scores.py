@@ -168,6 +168,14 @@ def test_returns_of_an_environment() -> None:
     assert row["d4rl_score"] == 100
 
 
+def test_a_score_that_rounds_to_zero_has_no_sign(capsys: pytest.CaptureFixture[str]) -> None:
+    write_run(0, [-0.01])
+    main(["normalize"])
+    table = capsys.readouterr().out
+    assert "0.0" in table
+    assert "-0.0" not in table
+
+
 @pytest.mark.parametrize("style", FORMATS)
 def test_every_format_holds_every_number(style: str, capsys: pytest.CaptureFixture[str]) -> None:
     write_run(0, [90.0])
@@ -184,6 +192,7 @@ def test_every_format_holds_every_number(style: str, capsys: pytest.CaptureFixtu
     if style == "latex":
         assert "d4rl\\_score" not in text
         assert text.count("\\\\") == 2
+        assert "\\begin{tabular}{llrrrr" in text
 
 
 @pytest.mark.parametrize("style", FORMATS)

@@ -266,22 +266,25 @@ BAD: dict[str, tuple[str, str]] = {
     "unknown key": ('datasets = ["a-v0"]\nstep = 3\n[[algorithms]]\nname = "bc"', "did you mean 'steps'"),
     "bad seeds": (
         'datasets = ["a-v0"]\nseeds = [1, 1]\n[[algorithms]]\nname = "bc"',
-        "seeds must be a count or a list",
+        "seeds must be a count up to 100,000 or a list",
     ),
     "half a seed": (
         'datasets = ["a-v0"]\nseeds = 1.5\n[[algorithms]]\nname = "bc"',
-        "seeds must be a count or a list",
+        "seeds must be a count up to 100,000 or a list",
     ),
     "seeds on a day": (
         'datasets = ["a-v0"]\nseeds = 2026-01-01\n[[algorithms]]\nname = "bc"',
-        "seeds must be a count or a list",
+        "seeds must be a count up to 100,000 or a list",
     ),
     "a seed too many": (
         'datasets = ["a-v0"]\nseeds = 1000000000000\n[[algorithms]]\nname = "bc"',
-        "seeds must be a count or a list",
+        "seeds must be a count up to 100,000 or a list",
     ),
     "a number of 5000 digits": (f'datasets = ["a-v0"]\nsteps = {"1" * 5000}', "not a readable TOML file"),
-    "no seeds": ('datasets = ["a-v0"]\nseeds = 0\n[[algorithms]]\nname = "bc"', "seeds must be a count or a list"),
+    "no seeds": (
+        'datasets = ["a-v0"]\nseeds = 0\n[[algorithms]]\nname = "bc"',
+        "seeds must be a count up to 100,000 or a list",
+    ),
     "bad steps": ('datasets = ["a-v0"]\nsteps = 0\n[[algorithms]]\nname = "bc"', "steps must be at least 1"),
     "bad id": ('datasets = ["a"]\n[[algorithms]]\nname = "bc"', "is not a dataset id"),
     "twice": ('datasets = ["a-v0"]\n[[algorithms]]\nname = "bc"\n[[algorithms]]\nname = "bc"', "is listed twice"),
@@ -327,8 +330,8 @@ def test_a_bad_grid_is_one_line(fault: str, home: Path, capsys: pytest.CaptureFi
         (["./nothing.toml"], "no grid file"),
         (["smoke", "--budget", "9"], "a budget is a time"),
         (["smoke", "--budget=-9m"], "a budget must be positive"),
-        (["smoke", "--shard", "3"], "not a share such as 0/4"),
-        (["smoke", "--shard", "9/2", "--plan"], "a shard is i/n with i from 0 to n - 1, not 9/2"),
+        (["smoke", "--shard", "3"], "not a part I/N such as 0/4"),
+        (["smoke", "--shard", "9/2", "--plan"], "a part is I/N with I from 0 to N-1, not 9/2"),
         (["smoke", "--stack", "0"], "whole number from 1"),
     ],
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
+import shlex
 import shutil
 import warnings
 from pathlib import Path
@@ -19,8 +19,9 @@ from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
 from offbench.data import minari_store
 from offbench.reports.figures import plot_curves
+from tests.commands import refusal
 from tests.conftest import TINY_RECIPE
-from tests.data.test_transitions import episode, foreign
+from tests.made_datasets import episode, foreign
 
 CASES: dict[str, tuple[str, str]] = {
     # what the user typed: what the line must hold
@@ -42,10 +43,11 @@ CASES: dict[str, tuple[str, str]] = {
     "collect hopper --id ../../etc-v0": ("is not a dataset id", ""),
     "collect hopper --id /tmp/x-v0": ("is not a dataset id", ""),
     "collect hopper --id mine//x-v0": ("is not a dataset id", "mine/name-v0"),
+    "collect hopper --policy x.zip --level medium": ("leave out --level and --mix", ""),
     "collect hopper --policy x.zip --accept": ("--accept is about the policy that --level or --mix chooses", ""),
     "collect hopper --mix random": ("--mix takes LEVEL:SHARE", ""),
     "collect hopper --mix random:0.5,expert:0.4": ("must add up to 1, not 0.9", ""),
-    "collect hopper --level expert --mix random:0.5,expert:0.5": ("give --level or --mix, not both", ""),
+    "collect hopper --level medium --mix random:0.5,expert:0.5": ("give --level or --mix, not both", ""),
     "collect hopper --mix randm:0.5,expert:0.5": ("unknown level 'randm': did you mean 'random'?", ""),
     "collect hopper --mix medium-expert:0.5,random:0.5": ("--mix takes single levels", ""),
     "collect ./none.toml": ("no recipe file none.toml", ""),
@@ -58,7 +60,9 @@ CASES: dict[str, tuple[str, str]] = {
     "evaluate x --similarity --episodes 5": ("--episodes has no effect with --similarity", ""),
     "evaluate x --tolerance 0": ("--tolerance has no effect without --similarity", ""),
     "video hopper:medium --env walker2d": ("hopper:medium names its environment already", "--env"),
-    "benchmark smoke --plan --address auto": ("--address needs", "--executor ray"),
+    "benchmark smoke --plan --address auto": ("--address has no effect with --plan; leave it out", ""),
+    "benchmark smoke --plan --budget 5x": ("--budget has no effect with --plan; leave it out", ""),
+    "benchmark smoke --address auto": ("--address needs", "--executor ray"),
     "train bdb --dataset MEDIUM --beta 2": ("bdb: beta must be at most 1, not 2", ""),
     "train bdb --dataset MEDIUM --beta adaptve": ("beta must be a number or adaptive, not 'adaptve'", ""),
     "train bdb --dataset MEDIUM --alpha nan": ("alpha must be a finite number", ""),
@@ -106,18 +110,25 @@ CASES: dict[str, tuple[str, str]] = {
     "normalize --env hopper abc": ("'abc' is not a number", ""),
     "normalize --env hopper nan": ("returns must be finite numbers", ""),
     "normalize --env hopper 1 --steps 5": ("--steps has no effect with --env; leave it out", ""),
-    "normalize --env hopper 1 --runs other": ("--runs has no effect with --env; leave it out", ""),
+    "normalize --env hopper 1 --runs runs": ("--runs has no effect with --env; leave it out", ""),
     "normalize --env hopper 1 --plot x.png": ("--plot has no effect with --env; leave it out", ""),
+    "list runs --runs nowhere": ("nowhere is not a folder of runs", ""),
     "list --runs other": ("--runs has an effect only in `offbench list runs`", ""),
-    "card x-v0 --huggingface --behaviour-dir other": ("--behaviour-dir has no effect with --huggingface", ""),
+    "card x-v0 --huggingface --behaviour-dir behaviour": ("--behaviour-dir has no effect with --huggingface", ""),
     "evaluate x --similarity --tolerance nan": ("tolerances must be finite numbers from 0", ""),
+    "normalize --plot curves.gif": ("a figure's name must end in", ".png"),
     "normalize --format html": ("invalid choice: 'html'", ""),
     "list files": ("invalid choice: 'files'", "runs"),
     "report --runs nowhere here": ("no evaluated runs below nowhere, here", "offbench train"),
     "compare td3_bc": ("the following arguments are required: B", "--help"),
     "compare td3_bc cql --runs nowhere": ("no evaluated runs below nowhere", ""),
     "train --tensorboard td3_bc --dataset x-v0": ("unknown dataset 'x-v0'", ""),
-    "train --tensorb td3_bc --dataset x-v0": ("unknown dataset 'x-v0'", ""),
+    "train --tensorb td3_bc --dataset x-v0": ("--tensorb: did you mean --tensorboard?", ""),
+    "train 'bdb (beta=0.5)' --dataset MEDIUM --beta 0.7": ("beta is part of the method's name and of the flags", ""),
+    "train 'td3_bc (precision=bfloat16)' --dataset MEDIUM --precision float32": (
+        "precision is part of the method",
+        "",
+    ),
     "train --seeds=0,1 td3_bc --dataset x-v0": ("unknown dataset 'x-v0'", ""),
     "train --dataset x-v0 -- td3_bc": ("unknown dataset 'x-v0'", ""),
     "train td3_bc --dataset MEDIUM --wandb": ("argument --wandb: expected one argument", ""),
@@ -159,13 +170,10 @@ CASES: dict[str, tuple[str, str]] = {
     "import-d4rl D4RL --id MEDIUM --env inverted-pendulum": ("tiny-medium-v0 exists already", "--overwrite"),
     "export": ("the following arguments are required: ID, --out", ""),
     "export x-v0 --out out.hdf5": ("unknown dataset 'x-v0'", ""),
-    "export MEDIUM --out out.hdf5 --format csv": ("invalid choice: 'csv'", ""),
-    "export MEDIUM --out out.hdf5 --drop-timeouts": ("--drop-timeouts goes with --format npz", ""),
+    "export MEDIUM --out out.hdf5 --drop-timeouts": ("--drop-timeouts needs an .npz file", ""),
     "export MEDIUM --out .": ("cannot write", ""),
     "export MEDIUM --out empty.safetensors/out.hdf5": ("cannot write", ""),
     "export MEDIUM --out out.csv": ("cannot write 'out.csv'", ".npz"),
-    "export MEDIUM --out out.npz --format d4rl": ("cannot write 'out.npz'", ".hdf5"),
-    "export MEDIUM --out out.hdf5 --format npz": ("cannot write 'out.hdf5'", ".npz"),
     "card MEDIUM": ("is a dataset: give --huggingface", ""),
     "export-policy policy.safetensors --out policy.txt": ("cannot write 'policy.txt'", ".pt or FILE.onnx"),
     "report --out report.html": ("a report is a folder", "--out report"),
@@ -208,25 +216,9 @@ def prepared(medium: str, home: Path) -> dict[str, str]:
     }
 
 
-def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """Run the command line in this process; return its one line."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stopped:
-        main(words)
-    out, err = capsys.readouterr()
-    assert stopped.value.code == 2
-    notices = ("converting ", "offbench: using the behaviour agent")
-    said = [line for line in err.splitlines() if not line.startswith(notices)]
-    lines = [line for line in said if not re.fullmatch(r"\S+ on \S+: resuming from step [\d,]+", line)]
-    assert len(lines) == 1, err
-    assert lines[0].startswith("offbench: ")
-    assert "Traceback" not in out + err
-    return lines[0]
-
-
 @pytest.mark.parametrize("typed", CASES)
 def test_bad_words(typed: str, prepared: dict[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    line = refusal([prepared.get(word, word) for word in typed.split()], capsys)
+    line = refusal([prepared.get(word, word) for word in shlex.split(typed)], capsys)
     for part in CASES[typed]:
         assert part in line
 

@@ -115,7 +115,7 @@ def test_every_option_reaches_the_function(command: str, calls: Calls) -> None:
             continue
         name = action.dest.removeprefix("setting_")
         if command == "card":  # it passes arguments by position
-            name = {"out": 1, "behaviour_dir": 2}.get(name, name)
+            name = {"out": 1}.get(name, name)
         assert arguments[name] == value, option
         assert called(line, calls)[1].get(name) != value, f"{option}: the test's value is the default"
 

@@ -20,7 +20,7 @@ from offbench.data.import_d4rl import import_d4rl
 from offbench.data.minari_reader import episodes_of, open_minari
 from offbench.verification.verify import verify
 from tests.data.test_import_and_export import ACT, LENGTHS, OBS, Columns, d4rl_file, qlearning
-from tests.data.test_transitions import episode, foreign
+from tests.made_datasets import episode, foreign
 
 
 def lengths(name: str) -> list[int]:

@@ -20,8 +20,8 @@ from offbench.data.export import export
 from offbench.data.import_d4rl import import_d4rl
 from offbench.data.minari_reader import episodes_of, open_minari
 from offbench.verification.verify import verify
-from tests.cli.test_bad_input import refusal
-from tests.data.test_transitions import episode, foreign
+from tests.commands import refusal
+from tests.made_datasets import episode, foreign
 
 Columns = dict[str, npt.NDArray[Any]]
 KEYS = ("observations", "actions", "rewards", "next_observations", "terminals")
@@ -99,7 +99,7 @@ TAILS: dict[str, list[tuple[int, str]]] = {
 def test_transitions_are_those_of_d4rls_loader(version: int, tail: str, home: Path, rng: np.random.Generator) -> None:
     file = d4rl_file(home / f"hopper_medium-v{version}.hdf5", LENGTHS + TAILS[tail], version, rng)
     import_d4rl(home / f"hopper_medium-v{version}.hdf5", "theirs-v0")
-    with np.load(export("theirs-v0", home / "out.npz", style="npz", drop_timeouts=True), allow_pickle=False) as arrays:
+    with np.load(export("theirs-v0", home / "out.npz", drop_timeouts=True), allow_pickle=False) as arrays:
         ours = dict(arrays)
     theirs = qlearning(file)
     if TAILS[tail][-1][1] == "terminal":  # the very last row, which their loop never reaches: a termination is kept
@@ -228,7 +228,7 @@ def test_the_references_of_another_environment_are_left_out(
 
 
 def test_npz_holds_what_offbench_trains_on(medium: str, home: Path) -> None:
-    main(["export", medium, "--out", "arrays.npz", "--format", "npz"])
+    main(["export", medium, "--out", "arrays.npz"])
     with np.load(home / "arrays.npz", allow_pickle=False) as file:
         arrays = dict(file)
     data = offbench.load(medium)

@@ -74,7 +74,7 @@ def test_every_block_of_the_page_runs(d3rlpy: str, home: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["td3_bc", "bear"])
 def test_d3rlpys_weights_act_here_as_there(algorithm: str, d3rlpy: str, medium: str, tmp_path: Path) -> None:
-    data = offbench.export(medium, tmp_path / "data.npz", style="npz")
+    data = offbench.export(medium, tmp_path / "data.npz")
     words = [d3rlpy, beside_d3rlpy.__file__, "learn", algorithm, str(data), "0", str(tmp_path), "20", "10"]
     subprocess.run(words, check=True, capture_output=True)
     assert [name for name in ("10", "20") if (tmp_path / f"{name}.npz").exists()] == ["10", "20"]

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 import offbench
 from offbench.data import minari_store
-from tests.data.test_transitions import episode, foreign
+from tests.made_datasets import episode, foreign
 
 
 @pytest.fixture

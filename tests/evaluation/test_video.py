@@ -16,7 +16,7 @@ from offbench.common.errors import OffbenchError
 from offbench.envs.environments import env_spec
 from offbench.envs.recipes import recipes_folder
 from offbench.evaluation import renderer, video
-from tests.cli.test_bad_input import refusal
+from tests.commands import refusal
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]
 POLICY = next((recipes_folder() / "inverted-pendulum" / "behaviour" / "policies").glob("*.safetensors"))

@@ -22,7 +22,7 @@ from offbench.common import files
 from offbench.data import file_stamps, minari_store, minari_writer, transitions
 from offbench.data.minari_reader import episodes_of, open_minari
 from offbench.rollouts.policy import uniform_policy
-from tests.cli.test_bad_input import refusal
+from tests.commands import refusal
 
 REWARDS = "episode_0/rewards"
 

@@ -23,7 +23,7 @@ from offbench.common.text import printable
 from offbench.data import transitions
 from offbench.training import registry
 from offbench.training.run import Run, find_runs
-from tests.cli.test_bad_input import refusal
+from tests.commands import refusal
 from tests.made_runs import made_run
 
 ROWS = "step,episode,return,length\n100,0,1.0,5\n100,1,2.0,5\n200,0,3.0,5\n200,1,4.0,5\n"

@@ -145,7 +145,7 @@ def test_a_similar_score_is_not_written_into_a_run_that_is_trained(medium: str) 
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("command", ["collect", "import-d4rl", "export", "export --format npz"])
+@pytest.mark.parametrize("command", ["collect", "import-d4rl", "export", "export npz"])
 @pytest.mark.parametrize("call", [1, 20])
 def test_a_stop_within_a_write_of_hdf5_is_a_stop(
     command: str,
@@ -163,7 +163,7 @@ def test_a_stop_within_a_write_of_hdf5_is_a_stop(
         "collect": ["collect", tiny[0], "--level", "random", "--behaviour-dir", tiny[1], "--workers", "1"],
         "import-d4rl": ["import-d4rl", str(export(medium, home / "in.hdf5")), "--id", "back-v0"],
         "export": ["export", medium, "--out", "out.hdf5"],
-        "export --format npz": ["export", medium, "--out", "out.npz"],
+        "export npz": ["export", medium, "--out", "out.npz"],
     }[command]
     before = {path for path in home.rglob("*") if path.suffix not in (".lock", ".tmp")}
     monkeypatch.setattr(hdf5_file, "memoryview", memoryview, raising=False)  # which `write` and `readinto` call

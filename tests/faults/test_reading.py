@@ -22,7 +22,7 @@ from offbench.data import minari_store
 from offbench.data.export import export
 from offbench.training.run import Run
 from offbench.verification.verify import verify
-from tests.data.test_transitions import episode, foreign
+from tests.made_datasets import episode, foreign
 
 HOLD = "import h5py, sys, time; file = h5py.File(sys.argv[1], 'r+'); print('held', flush=True); time.sleep(60)"
 

@@ -25,7 +25,7 @@ from offbench.evaluation import renderer
 from offbench.evaluation.evaluate import evaluate, open_policy
 from offbench.rollouts.policy import uniform_policy
 from offbench.training.run import Run
-from tests.cli.test_bad_input import refusal
+from tests.commands import refusal
 from tests.faults.test_integrity import trained
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]

@@ -202,6 +202,10 @@ def test_unfinished_and_unbegun_runs_are_marked(home: Path) -> None:
     assert "hopper-medium-v0/cql/default/seed-0" in page.text
     states = {row["method"]: row["state"] for row in rows(home / "out" / "tables" / "seeds.csv")}
     assert states == {"td3_bc": "unfinished", "cql": "not evaluated yet"}
+    made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 1, 50, reached=0)
+    offbench.report(home / "runs", home / "out", methods=["td3_bc"])
+    states = {(row["method"], row["seed"]): row["state"] for row in rows(home / "out" / "tables" / "seeds.csv")}
+    assert states == {("td3_bc", "0"): "unfinished", ("td3_bc", "1"): "not evaluated yet"}
 
 
 def test_a_diverged_run_is_marked(home: Path) -> None:

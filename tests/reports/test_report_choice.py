@@ -58,6 +58,15 @@ def test_several_folders_are_one_report(home: Path) -> None:
     assert "theirs/x-medium-v0/cql/default/seed-1" in page.text
 
 
+def test_folders_of_one_name_are_told_apart(home: Path) -> None:
+    scored(home / "x" / "runs", "td3_bc", "default", 50)
+    scored(home / "y" / "runs", "cql", "default", 60)
+    page = Page(offbench.report(["x/runs", "y/runs", "x/runs"], "out"))
+    assert "x/runs/x-medium-v0/td3_bc/default/seed-0" in page.text
+    assert "y/runs/x-medium-v0/cql/default/seed-1" in page.text
+    assert str(home) not in page.text
+
+
 def test_the_best_variant_of_a_sweep(home: Path) -> None:
     for variant, value in {"alpha=1": 40.0, "alpha=2": 70.0, "alpha=3": 50.0}.items():
         scored(home / "runs", "td3_bc", variant, value)

@@ -64,14 +64,23 @@ def test_earlier_runs_are_reported(home: Path) -> None:
     assert len(find_runs(home / "runs")) == len(SETTINGS)
 
 
-@pytest.mark.parametrize("beta", [["--beta", "learned"], ["--beta=learned"]])
-def test_a_learned_beta_trains_bdb_plus(beta: list[str], home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("method", [["bdb", "--beta", "learned"], ["bdb", "--beta=learned"], ["bdb (learned)"]])
+def test_a_learned_beta_trains_bdb_plus(method: list[str], home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(EARLIER / "minari", home / "minari")
-    words = "train bdb --dataset pendulum-small-v0 --steps 4 --eval-every 2 --eval-episodes 1 --hidden 8,8 --workers 1"
-    main([*words.split(), *beta])
+    words = "--dataset pendulum-small-v0 --steps 4 --eval-every 2 --eval-episodes 1 --hidden 8,8 --workers 1"
+    main(["train", *method, *words.split()])
     assert "--beta learned is an option of bdb_plus, no longer of bdb" in capsys.readouterr().err
     (run,) = find_runs(home / "runs")
     assert (run.config().algorithm, run.config().settings["beta"]) == ("bdb_plus", "learned")
+
+
+@pytest.mark.parametrize("words", [["--runs", "learned"], ["--beta", "0.5", "--runs", "learned"]])
+def test_a_folder_named_learned_trains_bdb(words: list[str], home: Path) -> None:
+    shutil.copytree(EARLIER / "minari", home / "minari")
+    small = "--dataset pendulum-small-v0 --steps 4 --eval-every 2 --eval-episodes 1 --hidden 8,8 --workers 1"
+    main(["train", "bdb", *small.split(), *words])
+    (run,) = find_runs(home / "learned")
+    assert run.config().algorithm == "bdb"
 
 
 def test_options_that_bdb_had_train_bdb_plus(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

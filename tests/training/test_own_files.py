@@ -25,7 +25,7 @@ from offbench.training import registry, source_code
 from offbench.training.restore import restore
 from offbench.training.run import Run
 from offbench.training.source_code import code_of
-from tests.cli.test_bad_input import refusal
+from tests.commands import refusal
 from tests.conftest import ROOT, forget_modules
 from tests.made_runs import made_run
 

@@ -26,7 +26,7 @@ from offbench.training.registry import load_algorithm
 from offbench.training.run import Run
 from offbench.training.spec import Job, RunSpec, configurations
 from offbench.training.train import Training
-from tests.data.test_transitions import episode, foreign
+from tests.made_datasets import episode, foreign
 
 SMALL: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32}
 TIMES: dict[str, Any] = {"eval_every": 100, "eval_episodes": 2}

@@ -20,7 +20,7 @@ from offbench.data.minari_reader import episodes_of, open_minari
 from offbench.envs.environments import env_spec
 from offbench.verification.findings import FAULTS, Finding, Report
 from offbench.verification.verify import verify
-from tests.data.test_transitions import episode, foreign
+from tests.made_datasets import episode, foreign
 
 Edit = Callable[[h5py.File], object]
 

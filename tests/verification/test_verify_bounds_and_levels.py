@@ -15,7 +15,7 @@ from offbench.data import minari_store
 from offbench.data.minari_reader import episodes_of, open_minari
 from offbench.envs.environments import env_spec
 from offbench.verification.verify import verify
-from tests.data.test_transitions import episode, foreign
+from tests.made_datasets import episode, foreign
 from tests.verification.test_verify import change_metadata, codes, tamper
 
 

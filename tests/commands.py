@@ -1,0 +1,25 @@
+"""Runs the command line in a test's process."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from offbench.cli.main import main
+
+
+def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """Run the command line in this process; return its one line."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    out, err = capsys.readouterr()
+    assert stopped.value.code == 2
+    notices = ("converting ", "offbench: using the behaviour agent")
+    said = [line for line in err.splitlines() if not line.startswith(notices)]
+    lines = [line for line in said if not re.fullmatch(r"\S+ on \S+: resuming from step [\d,]+", line)]
+    assert len(lines) == 1, err
+    assert lines[0].startswith("offbench: ")
+    assert "Traceback" not in out + err
+    return lines[0]
