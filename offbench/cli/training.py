@@ -94,7 +94,8 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         if any(Run(folder).evaluations() for folder in folders):
             hint("offbench", "normalize", *([] if rest["runs"] == "runs" else ["--runs", rest["runs"]]))
         else:
-            note("the dataset names no environment to evaluate in; give one to `offbench evaluate RUN --env ENV`")
+            command = shlex.join(["offbench", "evaluate", str(folders[0]), "--env", "ENV"])
+            note(f"the dataset names no environment to evaluate in; give one: `{command}`")
 
     parser.set_defaults(run=run)
 

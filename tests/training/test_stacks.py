@@ -178,7 +178,7 @@ def test_data_without_an_environment_are_trained_on_and_that_is_said(
     out, err = capsys.readouterr()
     assert "house-v0 names no environment" in err
     assert "normalize" not in out
-    assert "next: offbench evaluate runs/house-v0/bc/hidden=8x8/seed-0 --env" in err
+    assert "give one: `offbench evaluate runs/house-v0/bc/hidden=8x8/seed-0 --env ENV`" in err
 
 
 def test_each_run_of_a_stack_has_the_mean_of_its_own_updates(medium: str) -> None:
