@@ -1,8 +1,11 @@
-"""Runs the command line in a test's process."""
+"""Ways to run the command line."""
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 
 import pytest
 
@@ -23,3 +26,17 @@ def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     assert lines[0].startswith("offbench: ")
     assert "Traceback" not in out + err
     return lines[0]
+
+
+def run_offbench(*words: str, before: str = "", **how: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line in a process of its own.
+
+    Args:
+        before: shell commands before it, such as `exec >/dev/full;`.
+        how: environment variables.
+    """
+    command = f'{before} exec "$0" -m offbench "$@"'
+    environment = os.environ | how
+    return subprocess.run(
+        ["sh", "-c", command, sys.executable, *words], env=environment, capture_output=True, text=True, check=False
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -100,3 +101,27 @@ def made_grid(root: Path, envs: tuple[str, ...] = ("hopper",), seeds: int = 3, l
                     similar = {"q_similar": 99.0 - 3 * place - seed, "action_similar": 80.0 - 5 * place}
                     write_json(run.folder / "similarity.json", found | similar)
     return root
+
+
+ROWS = "step,episode,return,length\n100,0,1.0,5\n100,1,2.0,5\n200,0,3.0,5\n200,1,4.0,5\n"
+
+
+def small_run(folder: Path, rows: str = ROWS, references: list[float] | None = None) -> Run:
+    """Write a run of two evaluations of two episodes."""
+    seed = int(folder.name.removeprefix("seed-"))
+    folder.mkdir(parents=True)
+    config = {
+        "format": "offbench-run-1",
+        "algorithm": "bc",
+        "variant": "default",
+        "settings": {},
+        "dataset": "a-random-v0",
+        "dataset_sha256": "0",
+        "seed": seed,
+        "steps": 200,
+        "eval_episodes": 2,
+        "references": {"dataset": references or [0.0, 10.0]},
+    }
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "evaluations.csv").write_text(rows)
+    return Run(folder)

@@ -1,10 +1,13 @@
-"""What the random tests have tried in all, at the end of the output: for `make nightly`."""
+"""A small dataset, and what the random tests have tried in all, at the end of the output: for `make nightly`."""
 
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 
 import pytest
+
+import offbench
 
 WHAT = {"kills": "commands were killed", "files": "damaged files were read", "refused": "of these were refused"}
 
@@ -22,3 +25,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
             terminalreporter.write_line(f"{counts[name]:,} {words}")
     failed = len(terminalreporter.getreports("failed")) + len(terminalreporter.getreports("error"))
     terminalreporter.write_line(f"{failed} tests failed, which are not counted" if failed else "none failed")
+
+
+@pytest.fixture
+def recorded(home: Path) -> str:
+    """The id of a small dataset."""
+    return offbench.collect("inverted-pendulum", "random", steps=300, workers=1)

@@ -1,9 +1,13 @@
-"""Handed-over files whose hashes match: a ladder's replay, checkpoints, policies, a run's settings and losses."""
+"""Policy files, agents' zips and ladders of others: damage is noticed, and nothing that they name is imported."""
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import json
 import shutil
+import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,22 +16,15 @@ import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
-from safetensors import safe_open
-from safetensors.torch import save_file
+import torch
 
 import offbench
-from offbench.analysis.normalize import render
-from offbench.common import checkpoints
+from offbench.agents.sb3_zip import read_sb3_zip
 from offbench.common.errors import OffbenchError
 from offbench.common.files import sha256_of
 from offbench.common.seeds import Purpose, generator
-from offbench.evaluation.similarity import similarity
-from offbench.rollouts.policy import MAX_CRITIC_VALUES, Policy
+from offbench.rollouts.policy import MAX_CRITIC_VALUES, Policy, uniform_policy
 from offbench.rollouts.rollouts import NOISE_BLOCK, EpisodeTask, _RunningEpisode
-from offbench.training.run import Run
-from tests.made_runs import made_run
-
-SMALL: dict[str, Any] = {"eval_every": 50, "eval_episodes": 1, "workers": 1, "hidden": (8, 8), "batch_size": 16}
 
 
 def replaced(file: h5py.File, name: str, **changes: Any) -> None:
@@ -83,63 +80,6 @@ def test_a_damaged_replay_of_a_ladder_is_not_recorded(fault: str, tiny: tuple[st
         offbench.collect(tiny[0], "medium-replay", behaviour_dir=home / "behaviour", workers=1)
 
 
-def forge(path: Path, **changes: object) -> None:
-    """Change a checkpoint's state, with a hash that matches."""
-    with safe_open(path, framework="pt") as file:
-        state = json.loads(file.metadata()["offbench"])
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    del state["sha256"]
-    state |= changes
-    state["sha256"] = checkpoints._sha256(tensors, state)
-    save_file(tensors, path, {"offbench": json.dumps(state)})
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        *({"origin": value} for value in ([], "text", [["a", "b"]], 5)),
-        *({"unlogged": value} for value in (5, "abc", [1], [["a", 1]], {"a": 1}, None, [["a", "x", 1]])),
-        *({"unlogged": [["q_abs", *value]]} for value in ((1.0, "x"), ([], 2), (1.0, 0), (1.0, True))),
-    ],
-)
-def test_a_forged_state_of_a_checkpoint_is_damage(
-    change: dict[str, Any], medium: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (folder,) = offbench.train("td3_bc", medium, steps=100, **SMALL)
-    before = (folder / "evaluations.csv").read_bytes()
-    forge(checkpoints.path_of(folder, 100), **change)
-    offbench.train("td3_bc", medium, steps=150, **SMALL)  # from the checkpoint before it
-    assert "checkpoint-000000100.safetensors is damaged" in capsys.readouterr().err
-    assert (folder / "evaluations.csv").read_bytes().startswith(before)
-
-
-def test_settings_that_are_not_the_checkpoints_make_no_network(medium: str) -> None:
-    (folder,) = offbench.train("td3_bc", medium, steps=50, **SMALL)
-    path = Run(folder).config_path
-    config = json.loads(path.read_text())
-    config["settings"]["hidden"] = [200_000, 200_000]  # 300 GB
-    path.write_text(json.dumps(config))
-    with pytest.raises(OffbenchError, match=r"its hidden is \[8, 8\], not \[200000, 200000\]"):
-        similarity(folder)
-
-
-def test_a_beta_of_several_lines_is_one_line(home: Path) -> None:
-    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
-    config = json.loads(run.config_path.read_text())
-    config["settings"]["beta"] = "x\n| forged | 99.9 |" + "y" * 10**5
-    run.config_path.write_text(json.dumps(config))
-    lines = render(offbench.normalize(home / "runs")).splitlines()
-    assert not [line for line in lines if line.startswith("| forged")]
-    assert max(map(len, lines)) < 400
-
-
-@pytest.mark.parametrize("values", [(1e308, -1e308), (1e308, 1e308), (1e16, 1.0)])
-def test_losses_of_any_size_are_drawn(values: tuple[float, float], home: Path) -> None:
-    run = made_run(home / "runs", "hopper-medium-v0", "td3_bc", "default", 0, 50)
-    run.write_losses([{"step": 1000.0 * (i + 1), "q_abs": value} for i, value in enumerate(values)])
-    assert offbench.report(home / "runs", home / "out").exists()
-
-
 def best_by_q(samples: int, width: int) -> Policy:
     """A policy of zeros for InvertedPendulum: 4 observations, 1 action."""
     actor = ((np.zeros((4, 2), np.float32), np.zeros(2, np.float32)),)
@@ -171,3 +111,39 @@ def test_a_policy_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
     best_by_q(10_000, MAX_CRITIC_VALUES // 10_000 + 1).save(path)
     with pytest.raises(OffbenchError, match="would fill the memory"):
         offbench.load_policy(path)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA])
+def test_a_damaged_sb3_zip_is_one_line(method: int, tmp_path: Path) -> None:
+    """Whatever zipfile, zlib, lzma and torch raise for damaged bytes."""
+    weights = io.BytesIO()
+    torch.save({"actor.mu.weight": torch.randn(3, 4)}, weights, _use_new_zipfile_serialization=False)
+    path = tmp_path / "agent.zip"
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        body = bytearray(weights.getvalue())
+        if method == zipfile.ZIP_STORED:  # damage to the weights themselves
+            body[int(rng.integers(len(body)))] ^= int(rng.integers(1, 256))
+        with zipfile.ZipFile(path, "w", method) as archive:
+            archive.writestr("data", "{}")
+            archive.writestr("policy.pth", bytes(body))
+        if method != zipfile.ZIP_STORED:  # or to their compressed bytes
+            data = bytearray(path.read_bytes())
+            data[int(rng.integers(60, len(data) - 200))] ^= int(rng.integers(1, 256))
+            path.write_bytes(data)
+        with pytest.raises(OffbenchError, match=r"agent\.zip"):
+            read_sb3_zip(path, -np.ones(3, np.float32), np.ones(3, np.float32), "X-v0")
+
+
+def test_a_module_that_a_policy_names_is_not_imported(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (home / "evil.py").write_text("open('PWNED', 'w')")
+    monkeypatch.syspath_prepend(str(home))
+    low, high = np.array([-3.0], np.float32), np.array([3.0], np.float32)
+    policy = uniform_policy(low, high, 4, "evil:Evil-v0")
+    policy.save(home / "evil.safetensors")
+    with pytest.raises(offbench.OffbenchError, match=r"'evil:Evil-v0'.*--env"):
+        offbench.evaluate("evil.safetensors", episodes=1)
+    dataclasses.replace(policy, env_id="evil:InvertedPendulum-v5").save(home / "known.safetensors")
+    offbench.evaluate("known.safetensors", episodes=1)  # registered, so that no module is needed
+    assert "evil" not in sys.modules
+    assert not (home / "PWNED").exists()

@@ -19,18 +19,24 @@ from gymnasium.envs.registration import EnvSpec
 from offbench import collect, train
 from offbench.cli.main import main
 from offbench.common.errors import OffbenchError
-from offbench.envs.environments import env_spec
+from offbench.envs.environments import env_spec, make_env, untrusted_env
 from offbench.envs.trust import VARIABLE, check_code
 from offbench.evaluation import renderer
 from offbench.evaluation.evaluate import evaluate, open_policy
 from offbench.rollouts.policy import uniform_policy
 from offbench.training.run import Run
 from tests.commands import refusal
-from tests.faults.test_integrity import trained
+from tests.made_runs import small_run
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]
+
+
 POLE = json.loads(env_spec("InvertedPendulum-v5"))
+
+
 OWN = "from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv as Own\n"
+
+
 OWN += "open('IMPORTED', 'w').close()\n"
 
 
@@ -63,6 +69,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"kwargs": {"a": [0] * 20_000}}, "too many"),
     ({"kwargs": {"/etc/passwd": 0}}, "/etc/passwd"),
 ]
+
+
 NEVER: list[tuple[dict[str, Any], str]] = [  # with --trust neither
     (
         {"id": "Foo-v0", "entry_point": "gymnasium.envs.registration:load_env_creator"},
@@ -72,6 +80,8 @@ NEVER: list[tuple[dict[str, Any], str]] = [  # with --trust neither
     ({"id": "Foo-v0", "entry_point": "own"}, "'own' does not have the form module:Class"),
     (wrapped("gymnasium.envs.mujoco.hopper_v5:HopperEnv"), "is not a class derived from Wrapper"),
 ]
+
+
 ALLOWED: list[dict[str, Any]] = [
     {},
     {"id": "Foo-v0"},
@@ -92,7 +102,7 @@ def own(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def run_of(change: dict[str, Any], folder: Path) -> Path:
     """Write a run whose environment is the pole with a change."""
-    run = trained(folder / "seed-0")
+    run = small_run(folder / "seed-0")
     config = json.loads(run.config_path.read_text()) | {"env_spec": json.dumps(POLE | change)}
     run.config_path.write_text(json.dumps(config))
     uniform_policy(np.array([-3.0], np.float32), np.array([3.0], np.float32), 4, "").save(run.policy_path)
@@ -209,3 +219,77 @@ def test_the_renderer_is_probed_without_the_working_directory(home: Path) -> Non
     (home / "mujoco.py").write_text("open('RAN', 'w').close()\n")
     renderer.working_backend.__wrapped__()
     assert not (home / "RAN").exists()
+
+
+def test_a_folder_named_like_an_allowed_package_is_not_imported(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (home / "gym" / "envs").mkdir(parents=True)
+    for name in ("gym/__init__.py", "gym/envs/__init__.py", "gym/envs/evil.py"):
+        (home / name).write_text("open('ran', 'w')")
+    monkeypatch.syspath_prepend(home)
+    spec = json.loads(make_env_spec()) | {"id": "Foo-v0", "entry_point": "gym.envs.evil:X"}
+    with pytest.raises(OffbenchError, match=r"it would run gym\.envs\.evil from .*, where it is not installed"):
+        untrusted_env(json.dumps(spec), "the run")
+    assert not (home / "ran").exists()
+    package = home / "gym-0.26.dist-info"  # installed elsewhere, and hidden by that folder
+    package.mkdir()
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: gym\nVersion: 0.26\n")
+    (home / "site").mkdir()
+    package.rename(home / "site" / package.name)
+    monkeypatch.setattr(sys, "path", [*sys.path, str(home / "site")])
+    with pytest.raises(OffbenchError, match=r"it would run gym\.envs\.evil from .*, where it is not installed"):
+        untrusted_env(json.dumps(spec), "the run")
+    assert not (home / "ran").exists()
+
+
+def make_env_spec() -> str:
+    from offbench.envs.recipes import load_recipe
+
+    return load_recipe("inverted-pendulum").env_spec()
+
+
+def test_the_environment_of_a_file_opens_no_window() -> None:
+    spec = json.loads(make_env_spec())
+    spec["kwargs"] = {"render_mode": "human"}
+    env = make_env(json.dumps(spec))
+    assert env.render_mode is None
+    env.close()
+
+
+ABSTRACT = {"model_path": "inverted_pendulum.xml", "frame_skip": 2, "observation_space": None}
+
+
+def spec_of(**changes: Any) -> str:
+    return json.dumps(json.loads(gym.spec("InvertedPendulum-v5").to_json()) | changes)
+
+
+def wrappers(name: str, times: int, **kwargs: Any) -> list[dict[str, Any]]:
+    return [{"name": name, "entry_point": f"gymnasium.wrappers.{name}", "kwargs": kwargs}] * times
+
+
+@pytest.mark.parametrize("mode", ["human", "human_list", "rgb_array_list", "rgb_array", "nonsense", 3])
+def test_no_render_mode_of_a_file_is_used(mode: object) -> None:
+    env = make_env(spec_of(kwargs={"render_mode": mode}))
+    env.reset(seed=0)
+    assert env.render_mode is None
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"additional_wrappers": wrappers("stateful_action:RepeatAction", 3, num_repeats=100)}, "1,000,000"),
+        ({"additional_wrappers": wrappers("stateful_observation:MaxAndSkipObservation", 4, skip=20)}, "160,000"),
+        ({"additional_wrappers": wrappers("stateful_observation:FrameStackObservation", 2, stack_size=300)}, "90,000"),
+        ({"entry_point": "gymnasium.envs.registration:Env"}, "not a class derived from"),
+        ({"entry_point": "gymnasium:Env"}, "not among the environments"),
+        ({"max_episode_steps": True}, "its time limit is True"),
+        ({"max_episode_steps": 0}, "its time limit is 0"),
+        (
+            {"entry_point": "gymnasium.envs.mujoco.mujoco_env:MujocoEnv", "kwargs": ABSTRACT},
+            "has no observation_space",
+        ),
+    ],
+)
+def test_an_environment_of_a_file_that_is_none_or_never_ends(changes: dict[str, Any], fault: str) -> None:
+    with pytest.raises(OffbenchError, match=fault):
+        untrusted_env(spec_of(**changes), "file")
