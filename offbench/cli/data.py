@@ -118,7 +118,7 @@ def list_arguments(parser: Parser, _: list[str]) -> None:
 
         if runs is not None and what != "runs":
             parser.error("--runs has an effect only in `offbench list runs`")
-        contents = offbench.inventory(what, **({} if runs is None else {"runs": runs}))
+        contents = offbench.inventory(what, runs=runs)
         if json:
             print(dumps(contents, indent=1))
             return

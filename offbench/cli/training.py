@@ -76,7 +76,7 @@ def train_arguments(parser: Parser, words: list[str]) -> None:
         settings = {key.removeprefix("setting_"): v for key, v in arguments.items() if key.startswith("setting_")}
         rest = {key: value for key, value in arguments.items() if not key.startswith("setting_")}
         for name in named_settings:
-            if name in settings or name in rest:
+            if name in settings or (name == "precision" and name in rest):
                 raise OffbenchError(f"{name} is part of the method's name and of the flags; leave one out")
         rest["algorithm"], settings = algorithm, named_settings | settings
         if "precision" in named_settings:  # part of a method's name, but not a setting

@@ -221,6 +221,7 @@ def _renderer() -> Iterator[tuple[str, str]]:
 def _extras() -> Iterator[tuple[str, str]]:
     for module, purpose in EXTRAS.items():
         version = _version(module)
-        yield (
-            (NOTE, f"{module} is {version} ({purpose})") if version == "not installed" else (OK, f"{module} {version}")
-        )
+        if version == "not installed":
+            yield NOTE, f"{module} is {version} ({purpose})"
+        else:
+            yield OK, f"{module} {version}"
