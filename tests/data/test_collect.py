@@ -185,10 +185,19 @@ def test_a_recipe_that_measures_otherwise_than_its_agent_was_is_noted(
     assert "measured with other settings than the recipe's (replay_envs)" in capfd.readouterr().err
 
 
-def test_agents_of_other_seeds_are_named(home: Path, tiny: tuple[str, str], capfd: pytest.CaptureFixture[str]) -> None:
+def training(*_: object, **__: object) -> None:
+    """Stand in for a training."""
+    raise OffbenchError("training")
+
+
+def test_agents_of_other_seeds_are_named(
+    home: Path, tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     shutil.copytree(tiny[1], home / "behaviour")
     (home / "behaviour" / "tiny" / "seed-0").rename(home / "behaviour" / "tiny" / "seed-3")
-    offbench.collect(tiny[0], "medium", workers=1)
+    monkeypatch.setattr("offbench.agents.behaviour.behaviour", training)
+    with pytest.raises(OffbenchError, match="training"):
+        offbench.collect(tiny[0], "medium", workers=1)
     assert "no behaviour agent of seed 0 (there is seed-3" in capfd.readouterr().err
 
 
@@ -208,11 +217,7 @@ def test_another_spelling_of_a_level_is_the_same_dataset(
 
 def test_retrain_trains_for_random_too(tiny: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Its expert reference is the agent's."""
-
-    def trained(*_: object) -> None:
-        raise OffbenchError("training")
-
-    monkeypatch.setattr("offbench.data.collect._train", trained)
+    monkeypatch.setattr("offbench.agents.behaviour.behaviour", training)
     with pytest.raises(OffbenchError, match="training"):
         offbench.collect("inverted-pendulum", "random", retrain=True, workers=1)
 

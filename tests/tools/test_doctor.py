@@ -29,7 +29,7 @@ def test_a_sound_machine_has_nothing_broken(offbench_cli: Cli) -> None:
     assert "broken" not in done.stdout
 
 
-@pytest.mark.parametrize("package", ["h5py", "gymnasium", "torch"])
+@pytest.mark.parametrize("package", ["h5py", "torch"])
 def test_a_package_that_does_not_import_is_named(package: str, home: Path) -> None:
     """The other checks are done all the same."""
     (home / package).mkdir()
