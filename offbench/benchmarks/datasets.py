@@ -36,7 +36,7 @@ def record_dataset(dataset: GridDataset, workers: int) -> None:
             )
         except LockedError as error:  # another process records it, or trains its behaviour agent
             if not waiting:
-                inform(f"{str(error).rpartition('; ')[0]}; waiting for it")
+                inform(error.waiting)
             waiting = True
             time.sleep(WAIT)
         except OffbenchError:

@@ -21,6 +21,11 @@ class OffbenchError(Exception):
 class LockedError(OffbenchError):
     """Another process holds the lock, so it is doing this work."""
 
+    @property
+    def waiting(self) -> str:
+        """The text for a command that waits, without the remedy."""
+        return f"{str(self).rpartition('; ')[0]}; waiting for it"
+
 
 class DamagedError(OffbenchError):
     """The content of a file is invalid, as opposed to an error of the disk, a lock or a permission."""

@@ -34,7 +34,7 @@ def download(dataset_id: str) -> None:
         try:
             held.enter_context(exclusive_lock(lock, what))
         except LockedError as error:
-            inform(str(error))
+            inform(error.waiting)
             held.enter_context(exclusive_lock(lock, what, MAX_WAIT))
         if minari_store.exists(dataset_id):  # another process was faster
             return

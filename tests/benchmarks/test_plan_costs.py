@@ -12,7 +12,7 @@ import offbench
 from offbench.benchmarks import plan
 from offbench.benchmarks.grid import GridDataset
 from offbench.benchmarks.plan import Cost, prepare, write_plan
-from offbench.benchmarks.throughput import Rate
+from offbench.benchmarks.throughput import Rate, operations
 from offbench.envs.recipes import load_recipe
 from offbench.training.devices import Machine
 from offbench.training.registry import load_algorithm
@@ -68,3 +68,14 @@ def test_a_transition_takes_as_much_disk_space_as_the_plan_says(env: str, level:
     size = sum(path.stat().st_size for path in files) / 2000
     length = plan._episode_length(GridDataset("x-v0", env, level))
     assert plan._bytes_per_step(load_recipe(env).env_spec(), length) == pytest.approx(size, rel=0.2)
+
+
+def test_the_operations_of_an_update_are_those_of_the_middle_of_a_run() -> None:
+    """BEAR's warm-up leaves out the critic in the actor's loss."""
+    config = load_algorithm("bear").Config
+    small = {"hidden": (16, 16), "vae_hidden": (16,), "batch_size": 8}
+    costs = []
+    for warm_up in (0, 400, 1000):
+        spec = RunSpec("bear", config(**small, warm_up_steps=warm_up), "any-v0", 0, 1000, 100, 3, Path())
+        costs.append(operations(spec, load_recipe("inverted-pendulum").env_spec()))
+    assert costs[0] == costs[1] > costs[2]

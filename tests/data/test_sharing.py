@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import json
 import os
@@ -18,8 +19,9 @@ import yaml
 
 import offbench
 from offbench.cli.main import main
-from offbench.common.errors import OffbenchError
-from offbench.data import minari_store
+from offbench.common import files
+from offbench.common.errors import LockedError, OffbenchError
+from offbench.data import download, minari_store
 
 SMALL = ["--steps", "2", "--eval-every", "2", "--eval-episodes", "1", "--workers", "1", "--hidden", "8"]
 
@@ -219,6 +221,23 @@ def server(medium: str, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr(minari, "download_dataset", download_dataset)
     return asked
+
+
+def test_a_download_waits_for_that_of_another_process(
+    server: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lock = files.exclusive_lock
+
+    def held_for_a_while(path: Path, what: str, timeout: float = 3.0) -> contextlib.AbstractContextManager[None]:
+        if timeout < 60:
+            raise LockedError(f"{what} by process 1 on here; wait for it, or stop it")
+        return lock(path, what)
+
+    monkeypatch.setattr(download, "exclusive_lock", held_for_a_while)
+    download.download(NAMED)
+    assert server == [NAMED]
+    said = "another dataset is being downloaded by process 1 on here; waiting for it\n"
+    assert capsys.readouterr().err.count(said) == 1
 
 
 def test_train_downloads_what_is_not_here(

@@ -212,7 +212,13 @@ def test_arguments_of_other_natural_types_are_taken(medium: str, home: Path) -> 
     (home / "mine.py").write_text("from offbench.algos.bc import BC\nclass Mine(BC): pass\n")
     seeds: Any = np.array(3)
     device: Any = torch.device("cpu")
-    times: dict[str, Any] = {"steps": 10, "eval_every": 10, "eval_episodes": 1, "workers": np.int64(1)}
+    times: dict[str, Any] = {
+        "steps": 10,
+        "eval_every": 10,
+        "eval_episodes": 1,
+        "workers": np.int64(1),
+        "stack": np.int64(1),
+    }
     (folder,) = offbench.train(home / "mine.py", medium, seeds=seeds, device=device, **times, **SMALL)
     assert folder.name == "seed-3"
     text = '["tiny-medium-v0"]\nsteps = 10\neval_episodes = 1\n[[algorithms]]\nname = "bc"\nhidden = [8]\n'
@@ -222,6 +228,11 @@ def test_arguments_of_other_natural_types_are_taken(medium: str, home: Path) -> 
     many: Any = "many"
     with pytest.raises(OffbenchError, match="workers must be a whole number from 1 to 1,000, not 'many'"):
         offbench.train("bc", medium, workers=many)
+    for wrong in (None, 5, json):
+        with pytest.raises(OffbenchError, match=r"an algorithm is a name, a file .* or a class, not"):
+            offbench.train(wrong, medium)  # type: ignore[arg-type]
+    with pytest.raises(OffbenchError, match=r"a budget is a time like 9m, 1.5h or 90s, not \[1\]"):
+        benchmark(home / "grid.toml", budget=[1])  # type: ignore[arg-type]
 
 
 def test_an_algorithm_that_only_the_parent_process_can_import_is_unknown(
